@@ -88,5 +88,5 @@ def test_figures_show_every_point_and_image():
     assert [panel.get_title(loc="left") for panel in figure.axes] == ["a", "b"]
     marked = [line for line in figure.axes[0].lines if line.get_marker() != "None"]
     assert sum(len(line.get_xdata()) for line in marked) == 6
-    grid = draw_image_grid({"row": {"one": np.eye(3), "two": np.eye(3)}}, "", words="level")
+    grid = draw_image_grid({"row": {"one": np.eye(3), "two": np.eye(3)}}, "")
     assert [len(panel.images) for panel in grid.axes[:2]] == [1, 1]

@@ -32,7 +32,6 @@ _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#
 """Okabe and Ito's, which are told apart in every common colour blindness."""
 _MARKS = "oDs^vP*"
 _LIMIT: Mapping[str, Any] = {"color": "0.6", "lw": 1, "ls": ":", "zorder": 0}
-_FAINT = {"color": "0.93"}
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,10 @@ def draw_lines(
                 axis.set_major_locator(LogLocator(numticks=6))
                 axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
                 axis.set_minor_formatter(NullFormatter())
-        _clear(panel)
+        panel.grid(True, color="0.93")
+        panel.set_axisbelow(True)
+        panel.spines[["top", "right"]].set_visible(False)
+        panel.tick_params(labelsize=8.5)
     shown = names if lines else []
     keys = [
         Line2D([], [], color=look.colour, marker=look.mark, ls=look.style if join else "", label=n)
@@ -139,39 +141,23 @@ def draw_lines(
     return figure
 
 
-def draw_image_grid(
-    grid: Mapping[str, Mapping[str, NDArray[Any]]],
-    title: str,
-    *,
-    span: tuple[float, float] = (0.0, 255.0),
-    colours: str = "gray",
-    words: str = "",
-    aspect: float = 1.0,
-) -> Figure:
-    """Draw images (2-D) in rows and columns.
+def draw_image_grid(grid: Mapping[str, Mapping[str, NDArray[Any]]], title: str) -> Figure:
+    """Draw images (2-D) of 0 (black) to 255 in rows and columns.
 
     Args:
         grid: rows by name, and in each the images by the name of their column.
         title: of the figure.
-        span: values of the darkest and the lightest colour.
-        colours: Matplotlib's name of a colour map.
-        words: what the colours mean: beside a bar; none without words.
-        aspect: height of a pixel over its width.
     """
     columns = list(dict.fromkeys(name for row in grid.values() for name in row))
     figure = _empty(title, 2.7 * len(columns) + 0.9, 2.9 * len(grid) + 0.6)
     axes = figure.subplots(len(grid), len(columns), squeeze=False)
-    shown = None
     for line, (name, row) in zip(axes, grid.items(), strict=True):
         line[0].set_ylabel(name, fontsize=9)
         for panel, column in zip(line, columns, strict=True):
             panel.set(xticks=[], yticks=[], facecolor="0.85")
             panel.set_title(column if line is axes[0] else "", fontsize=9)
             if column in row:
-                look: Any = {"cmap": colours, "vmin": span[0], "vmax": span[1], "aspect": aspect}
-                shown = panel.imshow(row[column], interpolation="nearest", **look)
-    if shown is not None and words:
-        figure.colorbar(shown, ax=axes, shrink=0.6, pad=0.01, label=words)
+                panel.imshow(row[column], "gray", interpolation="nearest", vmin=0.0, vmax=255.0)
     return figure
 
 
@@ -199,11 +185,3 @@ def _empty(title: str, width: float, height: float) -> Figure:
     figure.set_label(title)
     figure.suptitle(title, fontsize=12, x=0.01, ha="left")
     return figure
-
-
-def _clear(panel: Axes) -> None:
-    """A faint grid behind the points, and no frame at the top and the right."""
-    panel.grid(True, **_FAINT)  # type: ignore[arg-type]
-    panel.set_axisbelow(True)
-    panel.spines[["top", "right"]].set_visible(False)
-    panel.tick_params(labelsize=8.5)

@@ -3,7 +3,7 @@
 >>> import os
 >>> from us_sim.evaluation.processes import usage_of
 >>> usage = usage_of(os.getpid())
->>> usage is None or usage.memory > 1e6
+>>> usage is None or usage["MB"] > 1.0
 True
 """
 
@@ -32,16 +32,13 @@ if TYPE_CHECKING:
     from us_sim.evaluation.latency.arrivals import Arrivals
 
 
-@dataclass(frozen=True)
-class Usage:
-    """Resources that a process has used until now."""
+def usage_of(pid: int) -> dict[str, float] | None:
+    """Tell what a process has used until now; None where it has ended, or the system is silent.
 
-    processor: float  # s, of all its threads
-    memory: float  # bytes, resident; a page that n processes share counts 1/n in each of them
-
-
-def usage_of(pid: int) -> Usage | None:
-    """Usage of a process; None where it has ended, or the system does not tell."""
+    Returns:
+        ``processor``, s of all its threads, and resident ``MB``; a page that n processes share
+        counts 1/n in each of them.
+    """
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
         sizes = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="utf-8")
@@ -51,7 +48,7 @@ def usage_of(pid: int) -> Usage | None:
     share = re.search(r"^Pss:\s+(\d+) kB", sizes, re.MULTILINE)  # proc(5): proportional set size
     if share is None:  # it has ended, and only its number is left
         return None
-    return Usage(ticks / os.sysconf("SC_CLK_TCK"), 1024.0 * int(share[1]))
+    return {"processor": ticks / os.sysconf("SC_CLK_TCK"), "MB": 1.024e-3 * int(share[1])}
 
 
 class UsageOverTime:
@@ -66,8 +63,7 @@ class UsageOverTime:
         passed = time.monotonic() - self._began
         for pid, name in started_by(self._parent).items():
             if (usage := usage_of(pid)) is not None:
-                use = {"processor": usage.processor, "MB": 1e-6 * usage.memory}
-                self._rows.append({"process": name, "s": passed, **use})
+                self._rows.append({"process": name, "s": passed, **usage})
 
     def table(self) -> pd.DataFrame:
         """A row a process and moment: ``process``, ``s``, ``processor`` (s) and ``MB``."""

@@ -74,25 +74,21 @@ class Target:
     met: bool | None = None  # None where it was not measured
 
     @classmethod
-    def at_most(
-        cls, what: str, limit: float, seen: float, unit: str = "", *, form: str = ".3g"
-    ) -> Target:
+    def at_most(cls, what: str, limit: float, seen: float, unit: str = "") -> Target:
         """A limit from above; ``seen`` is NaN where it was not measured."""
-        return cls._limit(what, f"at most {limit:g}", seen, seen <= limit, unit, form)
+        return cls._limit(what, f"at most {limit:g}", seen, seen <= limit, unit)
 
     @classmethod
-    def at_least(
-        cls, what: str, limit: float, seen: float, unit: str = "", *, form: str = ".3g"
-    ) -> Target:
+    def at_least(cls, what: str, limit: float, seen: float, unit: str = "") -> Target:
         """A limit from below; likewise."""
-        return cls._limit(what, f"at least {limit:g}", seen, seen >= limit, unit, form)
+        return cls._limit(what, f"at least {limit:g}", seen, seen >= limit, unit)
 
     @classmethod
-    def _limit(cls, what: str, asked: str, seen: float, met: bool, unit: str, form: str) -> Target:
+    def _limit(cls, what: str, asked: str, seen: float, met: bool, unit: str) -> Target:
         unit = unit and f" {unit}"
         if not np.isfinite(seen):
             return cls(what, asked + unit)
-        return cls(what, asked + unit, f"{seen:{form}}{unit}", bool(met))
+        return cls(what, asked + unit, f"{seen:.3g}{unit}", bool(met))
 
     @property
     def cells(self) -> tuple[str, str, str, str]:

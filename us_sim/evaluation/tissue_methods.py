@@ -1,20 +1,20 @@
 """The evaluated tissue solvers, one entry each; those of other packages are not evaluated.
 
 >>> from us_sim.evaluation.tissue_methods import TISSUE_METHODS
->>> TISSUE_METHODS["msds"].is_dynamic, TISSUE_METHODS["msds"].family("steps=5, stiffness=fitted")
-(True, 'fitted')
+>>> TISSUE_METHODS["msds"].is_dynamic, TISSUE_METHODS["msds"].settings[1]
+(True, {'steps': 5})
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, TypeAlias
 
 from us_sim.evaluation.figures import Look
 from us_sim.evaluation.independent_forces import (
     Forces,
-    averaged_hooke_forces,
     hooke_forces,
     neo_hookean_forces,
     spring_forces,
@@ -37,18 +37,11 @@ class TissueMethod:
     patient: Setting = field(default_factory=dict)  # settings with which it goes on until balance
     is_dynamic: bool = False  # of springs and masses, in time steps that are stable up to a limit
     is_judged_at_rest: bool = False  # under a held probe it must come to balance, nothing inverted
-    families: Mapping[str, str] = field(default_factory=dict)
-    """Names in plots of settings that change the equations."""
 
     @property
     def settings(self) -> tuple[Setting, ...]:
         """All that are tried, the defaults first."""
         return ({}, *self.tried)
-
-    def family(self, setting: str) -> str:
-        """Difference of a setting's equations, written ``a=1, b=2``, from the default's."""
-        parts = (self.families.get(part) for part in setting.split(", "))
-        return ", ".join(part for part in parts if part)
 
 
 def _spring_equations(model: TissueModel) -> Forces:
@@ -60,11 +53,11 @@ def _spring_equations(model: TissueModel) -> Forces:
 
 
 def _solid_equations(forces: Callable[..., Any]) -> Callable[[TissueModel], Forces]:
-    return lambda model: lambda displacement: forces(model.mesh, model.materials, displacement)
+    return lambda model: partial(forces, model.mesh, model.materials)
 
 
 _ALL = (
-    TissueMethod("fem", "#0072B2", "o", _solid_equations(averaged_hooke_forces)),
+    TissueMethod("fem", "#0072B2", "o", _solid_equations(partial(hooke_forces, averaged=True))),
     TissueMethod(
         "fem_nonlinear",
         colour="#D55E00",
@@ -91,13 +84,8 @@ _ALL = (
         colour="#009E73",
         mark="^",
         equations=_spring_equations,
-        tried=(
-            {"steps": 5},
-            {"steps": 80},
-            {"stiffness": "fitted"},
-        ),
+        tried=({"steps": 5}, {"steps": 80}, {"stiffness": "fitted"}),
         is_dynamic=True,
-        families={"stiffness=fitted": "fitted"},
     ),
 )
 TISSUE_METHODS = {method.name: method for method in _ALL}

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from neo_hookean_meshes import BOTH, CELLS, assert_cells_are_tetrahedra, assert_slopes, random_field
+from neo_hookean_meshes import BOTH, CELLS, assert_cells_are_tetrahedra, assert_slopes
 from scipy.integrate import quad
 from scipy.optimize import brentq, minimize
 from tissue_block import block, block_mesh
 
 from us_sim.errors import MaterialError, SolverError
-from us_sim.evaluation.independent_forces import neo_hookean_forces
 from us_sim.geometry.collider import RoundedBox
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
@@ -128,12 +127,8 @@ def test_forces_are_the_slope_of_the_energy_and_the_tangent_theirs(mesh, size):
 @pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1), size=st.floats(0.0, 0.02))
 @settings(max_examples=25, deadline=None)
-def test_cells_tetrahedra_and_the_formulas_written_again_agree(seed, size):
-    materials, displacement = vessels(CELLS, seed), random_field(size, seed)
-    assert_cells_are_tetrahedra(materials, size, seed)
-    expected = neo_hookean_forces(CELLS, materials, displacement.T).T
-    error = abs(NeoHookean(CELLS, materials, np.float64).forces(displacement) - expected).max()
-    assert error < 1e-6 * abs(expected).max() + 1e-12
+def test_cells_are_five_tetrahedra(seed, size):
+    assert_cells_are_tetrahedra(vessels(CELLS, seed), size, seed)
 
 
 @BOTH

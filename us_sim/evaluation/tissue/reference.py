@@ -4,7 +4,7 @@ Frictionless contact of the whole surface, not of nodes only, by augmented Lagra
 surface's quadrature points (P. Wriggers, Computational Contact Mechanics, 2nd ed., 2006, 9.3.3),
 and Newton's method with a line search. Elastic equilibrium without friction does not depend on the
 path, so a pose is approached in a few steps from rest. The block lies between its mirror plane
-y = 0 and its side; the probe must be as symmetric. Solutions are kept in the user's cache folder.
+y = 0 and its side; the probe must be as symmetric.
 
 >>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.evaluation.tissue.reference import solve_contact
@@ -17,22 +17,18 @@ y = 0 and its side; the probe must be as symmetric. Solutions are kept in the us
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import bsr_array, coo_array, csr_array, dia_array, kron
-from scipy.spatial import cKDTree
+from scipy.sparse import bsr_array, csr_array, dia_array, kron
+from scipy.sparse.linalg import LinearOperator, cg, splu
+from scipy.spatial import KDTree
 
-from us_sim.cache import Form, kept
 from us_sim.errors import SolverError
-from us_sim.evaluation.tissue import finite_elements
 from us_sim.evaluation.tissue.cases import Scene
-from us_sim.evaluation.tissue.finite_elements import NeoHookeanHexahedra, TwoLevel
+from us_sim.evaluation.tissue.finite_elements import NeoHookeanHexahedra
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
@@ -70,10 +66,6 @@ class Solution:
         side = np.where(points[:, 1:2] < 0, -1.0, 1.0) * [[0, 1, 0]] + [[1, 0, 1]]
         return self.block.at(self.displacement, points * side) * side
 
-    def pressure_near(self, points: Array) -> Array:
-        """(P,) Pa at the surface points that are nearest to rest positions (P, 3) m."""
-        return self.pressure[cKDTree(self.block.surface_points).query(points)[1]]
-
 
 def solve_contact(
     planes: Sequence[ArrayLike],
@@ -107,7 +99,8 @@ def solve_contact(
     search.penalty = _SOFT * modulus
     if start is not None:
         search.displacement = start.at(block.nodes) * search.free
-        search.push, penalties = start.pressure_near(block.surface_points), penalties[3:]
+        nearest = KDTree(start.block.surface_points).query(block.surface_points)[1]
+        search.push, penalties = start.pressure[nearest], penalties[3:]
     for pose in poses[:-1]:
         search.equilibrate(pose, _APPROACHING)
     for penalty in penalties:
@@ -136,9 +129,10 @@ class _Search:
         self.displacement = np.zeros_like(block.nodes)
         self.push = np.zeros(len(block.surface_points))  # Pa, multipliers
         self.free = _movable(block, block.nodes)
+        self._surface = csr_array(kron(block.surface_values, np.eye(3)))  # (3S, 3N)
+        self._mask = _diagonal(self.free.ravel().astype(float))
         coarse = np.flatnonzero(_movable(block, block.corners).ravel())
         spread = csr_array(kron(block.from_corners, np.eye(3)))
-        self._mask = _diagonal(self.free.ravel().astype(float))
         self._prolongation = (self._mask @ spread).tocsr()[:, coarse]
 
     def pressure(self, pose: Pose) -> tuple[Array, Array, Array]:
@@ -178,18 +172,15 @@ class _Search:
 
     def _step(self, pose: Pose, unbalanced: Array) -> Array:
         """(N, 3) m, of Newton's method; with a stiffer tangent where that is not definite."""
-        tangent = self._tangent(pose)
+        tangent, right = self._tangent(pose), -unbalanced.ravel()
         for part in _STIFFENED:
-            diagonal = bsr_array(_diagonal(part * tangent.diagonal()), blocksize=(3, 3))
-            system = TwoLevel(tangent + diagonal if part else tangent, self._prolongation)
-            step = system(-unbalanced.ravel(), 1e-3).reshape(-1, 3)
-            if system.is_definite:
+            stiffer = bsr_array(_diagonal(part * tangent.diagonal()), blocksize=(3, 3))
+            step = _solved(tangent + stiffer if part else tangent, right, self._prolongation)
+            if step @ right > 0.0:
                 break
-        return step
+        return step.reshape(-1, 3)
 
     def _energy(self, pose: Pose) -> float:
-        if not self.block.smallest_volume_ratio(self.displacement) > 0.0:
-            return np.inf
         pressure, _, _ = self.pressure(pose)
         contact = (self.block.surface_weights * pressure**2).sum() / (2 * self.penalty)
         return self.block.energy(self.displacement) + float(contact)
@@ -203,19 +194,12 @@ class _Search:
         return unbalanced, float(np.linalg.norm(pushes))
 
     def _tangent(self, pose: Pose) -> bsr_array:
-        block = self.block
         pressure, normal, curvature = self.pressure(pose)
         local = self.penalty * normal[:, :, None] * normal[:, None, :]
         local -= pressure[:, None, None] * curvature
-        local *= (block.surface_weights * (pressure > 0))[:, None, None]
-        values, parts = block.surface_values, []
-        for i in range(3):
-            for j in range(3):
-                part = (values.T @ _diagonal(local[:, i, j]) @ values).tocoo()
-                parts.append((part.data, 3 * part.row + i, 3 * part.col + j))
-        data, rows, columns = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))
-        matrix = block.stiffness(self.displacement)
-        matrix = matrix.tocsr() + coo_array((data, (rows, columns)), shape=matrix.shape).tocsr()
+        local *= (self.block.surface_weights * (pressure > 0))[:, None, None]
+        contact = self._surface.T @ _block_diagonal(local) @ self._surface
+        matrix = self.block.stiffness(self.displacement) + contact
         held = _diagonal(1.0 - self.free.ravel())
         return (self._mask @ matrix @ self._mask + held).tobsr((3, 3))
 
@@ -234,6 +218,36 @@ class _Search:
         return (distance - rounding, normal @ rotation.T, rotation @ curvature @ rotation.T)
 
 
+def _solved(matrix: bsr_array, right: Array, prolongation: csr_array) -> Array:
+    """(3N,) about the solution of a symmetric system, by conjugate gradients.
+
+    They are preconditioned by the inverse of the diagonal's blocks and by the same mesh with linear
+    elements, to whose nodes ``prolongation`` (3N, 3C) leads. Where the matrix is not definite, the
+    step may ascend.
+    """
+    rows = np.repeat(np.arange(len(matrix.indptr) - 1), np.diff(matrix.indptr))
+    smooth = _block_diagonal(np.linalg.inv(matrix.data[rows == matrix.indices]))
+    coarse = splu(
+        (prolongation.T @ matrix @ prolongation).tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+
+    def inverse(residual: Array) -> Array:
+        corrected = prolongation @ coarse.solve(prolongation.T @ residual)
+        return np.asarray(corrected + smooth @ residual)
+
+    goal, both = 1e-3 * float(np.linalg.norm(right)), LinearOperator(matrix.shape, inverse)
+    found, _ = cg(matrix, right, atol=goal, maxiter=400, M=both)
+    return np.asarray(found)
+
+
+def _block_diagonal(blocks: Array) -> bsr_array:
+    """(3B, 3B) of blocks (B, 3, 3)."""
+    return bsr_array((blocks, np.arange(len(blocks)), np.arange(len(blocks) + 1)))
+
+
 def _diagonal(entries: NDArray[np.floating]) -> dia_array:
     return dia_array((entries[None], [0]), shape=2 * entries.shape)
 
@@ -246,78 +260,21 @@ def _movable(block: NeoHookeanHexahedra, points: Array) -> NDArray[np.bool_]:
     return free
 
 
-_ARRAYS, _NUMBERS = ("displacement", "pressure", "force"), ("volume", "penetration")
-"""Arrays of a solution that are kept."""
-
-
-@dataclass(frozen=True, eq=False)
-class Reference:
-    """The solution at the end of a scene's path, and how much a coarser mesh differs."""
-
-    solution: Solution
-    size: float  # m, of the elements under the probe
-    coarser: float  # m, likewise, of the mesh compared with
-    difference: float  # relative L2, between the two
-    force_difference: float  # relative
-
-    @property
-    def unknowns(self) -> int:
-        """Displacement components of the whole block's half that was solved."""
-        return self.solution.displacement.size
-
-
-def kept_reference(scene: Scene, sizes: Sequence[float]) -> Reference:
-    """Return the reference of a scene, computed first if it is not kept.
+def solve_reference(scene: Scene, sizes: Sequence[float]) -> list[Solution]:
+    """Solve the end of a scene's path on finer and finer meshes.
 
     Args:
         scene: pressed as its path's end says.
-        sizes: m, of the elements under the probe, at least two: each mesh starts from the one
-            before, the last is the reference, and the one before it shows how far it has converged.
+        sizes: m, of the elements under the probe; each mesh starts from the one before.
 
     Raises:
         SolverError: no equilibrium was found.
     """
     solutions: list[Solution] = []
+    # Every second pose, and all of them where tissue hardly compresses.
+    poses = scene.path[::-2][::-1] if scene.poisson_ratio <= 0.45 else scene.path
     for size in sizes:
-        solutions.append(_kept(scene, size, solutions[-1] if solutions else None))
-    coarse, fine = solutions[-2:]
-    points = fine.block.corners
-    here, there = fine.at(points), coarse.at(points)
-    difference = float(np.linalg.norm(there - here) / np.linalg.norm(here))
-    forces = float(np.linalg.norm(coarse.force - fine.force) / np.linalg.norm(fine.force))
-    return Reference(fine, sizes[-1], sizes[-2], difference, forces)
-
-
-def _kept(scene: Scene, size: float, start: Solution | None) -> Solution:
-    planes = scene.reference_planes(size)
-
-    def pack(solution: Solution) -> tuple[dict[str, NDArray], dict[str, Any]]:
-        arrays = {name: getattr(solution, name) for name in _ARRAYS}
-        return arrays, {name: getattr(solution, name) for name in _NUMBERS}
-
-    def unpack(arrays: dict[str, Any], numbers: dict[str, Any]) -> Solution:
-        block = NeoHookeanHexahedra(planes, scene.material)
-        return Solution(block, **arrays, **{name: numbers[name] for name in _NUMBERS})
-
-    def make() -> Solution:
-        poses = _approach(scene) if start is None else scene.path[-1:]
-        return solve_contact(planes, scene.material, scene.collider, poses, start)
-
-    form = Form("reference.json", pack, unpack)
-    return kept(f"reference-{_hash(scene, planes)}", form, make)
-
-
-def _approach(scene: Scene) -> tuple[Pose, ...]:
-    """Every second pose of the path, up to the last; all of them where tissue hardly compresses."""
-    return scene.path[::-2][::-1] if scene.poisson_ratio <= 0.45 else scene.path
-
-
-def _hash(scene: Scene, planes: tuple[Array, ...]) -> str:
-    """Of everything that decides the solution, the code included."""
-    digest = hashlib.sha256()
-    for file in (str(finite_elements.__file__), __file__):
-        digest.update(Path(file).read_bytes())
-    for array in (*planes, *(pose.matrix for pose in _approach(scene)), scene.collider.offset_box):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    digest.update(repr(scene.material).encode())
-    return digest.hexdigest()[:16]
+        start, planes = solutions[-1] if solutions else None, scene.reference_planes(size)
+        some = scene.path[-1:] if start else poses
+        solutions.append(solve_contact(planes, scene.material, scene.collider, some, start))
+    return solutions

@@ -3,32 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
 from us_sim.evaluation.block import MESHES
-from us_sim.evaluation.figures import Look, draw_error_over_parameter, draw_error_over_time
+from us_sim.evaluation.figures import draw_error_over_time
 from us_sim.evaluation.subject import Report, Subject
 from us_sim.evaluation.tissue.cases import MAIN_SCENE, SCENES
 from us_sim.evaluation.tissue.measure import plan_pieces
-from us_sim.evaluation.tissue_methods import LOOKS, TISSUE_METHODS
+from us_sim.evaluation.tissue_methods import LOOKS
 
 _NODES = int(np.prod(MESHES[-1]))  # of the paper's finest mesh, on which results are shown
 _AT_FRAME_RATE = {"30 frames a second": 1000.0 / 30.0}  # ms
-_STYLES = ("-", "--", "-.", ":")
 _LABELS = {
     "ms_median": "ms a frame (median)",
     "rel_l2_error": "relative L2 error of the nodes",
-    "value": "",
 }
 
 
 def report_tissue(references: pd.DataFrame, points: pd.DataFrame) -> Report:
     """Say what the methods cost and how far they are off."""
     points = points.assign(
-        line=[_line(p.method, p.setting) for p in points.itertuples()],
+        line=points["method"] + points["setting"].map({"stiffness=fitted": ", fitted"}).fillna(""),
         default=points["setting"] == "default",
     )
     shown = points[points["nodes"] == _NODES]
@@ -43,7 +42,6 @@ def report_tissue(references: pd.DataFrame, points: pd.DataFrame) -> Report:
         "fronts": [f"**{scene}**: {_words(front)}." for scene, front in fronts.items()],
         "meshes": _draw_errors(main, "nodes", f"by nodes of the mesh, {SCENES[MAIN_SCENE].words}"),
         "estimates": _tabulate_estimates(defaults),
-        "size": _draw_sizes(main[main["default"]]),
     }
     return Report(list(_take_home(main, fronts)), places)
 
@@ -56,11 +54,6 @@ def _take_home(main: pd.DataFrame, fronts: dict[str, pd.DataFrame]) -> Iterator[
         )
     ahead = [f"`{name}`" for name in dict.fromkeys(pd.concat(fronts.values())["method"])]
     yield f"On the front of error against run time, over all scenes, are only {', '.join(ahead)}."
-
-
-def _line(method: str, setting: str) -> str:
-    family = TISSUE_METHODS[method].family(setting)
-    return f"{method}, {family}" if family else method
 
 
 def _pareto_front(points: pd.DataFrame) -> pd.DataFrame:
@@ -79,10 +72,10 @@ def _words(front: pd.DataFrame) -> str:
 
 def _draw_errors(points: pd.DataFrame, panels: str, words: str) -> Figure:
     """Full marks are defaults; a line joins a method's settings that solve the same equations."""
-    looks = {}
-    for name, lines in points.groupby("method")["line"]:
-        for line, style in zip(sorted(set(lines)), _STYLES, strict=False):
-            looks[line] = Look(LOOKS[name].colour, LOOKS[name].mark, style)
+    looks = {
+        line: replace(LOOKS[method], style="-" if line == method else "--")
+        for method, line in zip(points["method"], points["line"], strict=True)
+    }
     return draw_error_over_time(
         *(points, "ms_median", "rel_l2_error", f"Error against run time, {words}"),
         panels=panels,
@@ -91,20 +84,6 @@ def _draw_errors(points: pd.DataFrame, panels: str, words: str) -> Figure:
         labels=_LABELS,
         filled="default",
         limits=_AT_FRAME_RATE,
-    )
-
-
-def _draw_sizes(points: pd.DataFrame) -> Figure:
-    costs = points.rename(columns={"ms_median": "ms a frame (median)", "setup": "s to set up"})
-    costs = costs.melt(["method", "nodes"], ["ms a frame (median)", "s to set up"], "cost")
-    return draw_error_over_parameter(
-        *(costs, "nodes", "value", f"Cost against size, {SCENES[MAIN_SCENE].words}"),
-        panels="cost",
-        lines="method",
-        looks=LOOKS,
-        labels=_LABELS,
-        log="xy",
-        share_y=False,
     )
 
 
@@ -119,11 +98,9 @@ def _in_percent(points: pd.DataFrame) -> pd.DataFrame:
     return table
 
 
-def _tabulate_estimates(defaults: pd.DataFrame) -> pd.DataFrame | str:
+def _tabulate_estimates(defaults: pd.DataFrame) -> pd.DataFrame:
     """Errors that methods estimate by themselves beside the true ones."""
     found = defaults[defaults["estimated_error"].notna()]
-    if found.empty:
-        return ""
     table = found[["scene", "method", "nodes"]].copy()
     table["L2 %"] = 100 * found["rel_l2_error"]
     table["estimated %"] = 100 * found["estimated_error"].astype(float)
@@ -136,6 +113,6 @@ TISSUE = Subject(
     "Tissue: error against run time",
     plan_pieces,
     report_tissue,
-    hidden=("setup", "smallest_volume_ratio"),
+    hidden=("smallest_volume_ratio",),
     libraries=("scikit-fem",),
 )
