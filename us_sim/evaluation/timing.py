@@ -1,18 +1,12 @@
-"""Times of functions in turn, and frames until a tissue settles.
-
->>> from us_sim.evaluation.timing import frames_until
->>> frames_until([1.0, 1e-4, 0.5, 9e-4, 1e-6], 1e-3), frames_until([1.0], 1e-3)
-(3, None)
-"""
+"""Times of functions in turn."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 C = TypeVar("C")
 
@@ -42,13 +36,3 @@ def medians_in_turn(
             ended = time.process_time() if all_threads else time.thread_time()
             found[name].append(1e3 * (ended - began))
     return {name: float(np.median(ms[uncounted:])) for name, ms in found.items()}
-
-
-def frames_until(residual: Sequence[float] | NDArray[np.float64], small: float) -> int | None:
-    """After how many frames a residual is as small as asked and stays so; None where it is not.
-
-    The first residual is that of the frame before, so that none is needed where it is small.
-    """
-    large = np.flatnonzero(~(np.asarray(residual) <= small))
-    after = int(large[-1]) + 1 if len(large) else 0
-    return after if after < len(residual) else None

@@ -129,9 +129,8 @@ def predict_silicones(folder: Path) -> Iterator[dict[str, Any]]:
         }
 
 
-def plan_silicone(folder: Path, quick: bool) -> list[Piece]:
+def plan_silicone(folder: Path, _: bool) -> list[Piece]:
     """Predict all; it takes a second."""
-    del quick
     return [Piece({"study": "silicone"}, partial(predict_silicones, folder / "data"))]
 
 

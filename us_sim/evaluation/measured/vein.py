@@ -129,9 +129,8 @@ def measure_closing(posture: str, moduli: str, count: int) -> Iterator[dict[str,
     }
 
 
-def plan_vein(folder: Path, quick: bool) -> list[Piece]:
+def plan_vein(_: Path, quick: bool) -> list[Piece]:
     """Each posture with each set of moduli; no data are needed."""
-    del folder
     count = 22 if quick else 44
     return [
         Piece({"study": "vein"}, partial(measure_closing, posture, moduli, count))

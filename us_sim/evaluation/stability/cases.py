@@ -16,7 +16,7 @@ import copy
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -209,12 +209,6 @@ def _box(nx: int, ny: int, nz: int, size: float = 1.0) -> TetrahedralMesh:
     return box_mesh(x, y, uniform_planes(0.0, 0.08 * size, nz))
 
 
-def _layered() -> TetrahedralMesh:
-    """Cells a thousand times as wide as thick."""
-    across = uniform_planes(-0.05, 0.05, 4)
-    return box_mesh(across, across, [0.0, 3e-5, 0.02, 0.02003, 0.08])
-
-
 def _jittered(mesh: TetrahedralMesh, spread: float, seed: int) -> TetrahedralMesh:
     """Every node that is not on a face moved at random; those on faces within their face."""
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
@@ -236,19 +230,16 @@ def _delaunay() -> TetrahedralMesh:
     return TetrahedralMesh(points[used], renumbered.reshape(corners.shape))
 
 
-def _slab() -> TetrahedralMesh:
-    """A skin, 2 mm thick."""
-    across = uniform_planes(-0.05, 0.05, 6)
-    return box_mesh(across, across, uniform_planes(0.0, 0.002, 3))
-
+_across = partial(uniform_planes, -0.05, 0.05)
 
 MESHES: dict[str, Callable[[], TetrahedralMesh]] = {
     "box": lambda: _box(4, 4, 4),
     "fine": lambda: _box(6, 5, 5),
-    "layered": _layered,
+    # Cells a thousand times as wide as thick.
+    "layered": lambda: box_mesh(_across(4), _across(4), [0.0, 3e-5, 0.02, 0.02003, 0.08]),
     "perturbed": lambda: _jittered(_box(5, 4, 5), 0.004, seed=3),
     "delaunay": _delaunay,
-    "slab": _slab,
+    "slab": lambda: box_mesh(_across(6), _across(6), uniform_planes(0.0, 0.002, 3)),  # a skin
     "millimetre": lambda: _box(4, 4, 4, 0.01),
     "ten metres": lambda: _box(4, 4, 4, 100.0),
 }
@@ -305,54 +296,32 @@ def poses_of(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | No
             middle, so that a needle hits one.
         depth: reached, as a fraction of the mesh's thickness.
     """
-    top = mesh.nodes[mesh.nodes[:, 2] == mesh.nodes[:, 2].min()]
-    middle = mesh.nodes[:, :2].min(axis=0) + np.ptp(mesh.nodes[:, :2], axis=0) / 2
-    nearest = top[np.argmin(np.linalg.norm(top[:, :2] - middle, axis=1))]
-    above = np.array([nearest[0], nearest[1], 0.0])
-    return [
-        pose if pose is None or pose is LIFTED else Pose(pose.position + above, pose.orientation)
-        for pose in _centred(motion, mesh, depth)
-    ]
-
-
-def _centred(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | None]:
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
-    thick = high[2] - low[2]
-    wide = high[0] - low[0]
+    wide, breadth, thick = high - low
     deep = depth * thick
-    if motion == "press":
-        return [_at(z=part * deep) for part in (0.2, 0.4, 0.6, 0.8, 1, 1, 1)]
-    if motion == "jump":
-        return [_at(z=deep), _at(z=deep), _at(x=0.2 * wide, z=deep), _at(z=0.3 * deep)]
-    if motion == "through":
-        stops = (-0.2 * thick, deep, 2.5 * thick, deep, -0.2 * thick, deep)
-        return [_at(z=z) for z in stops]
-    if motion == "tremor":
-        # 1 kHz at 2718 frames a second: no small multiple, so that no phase repeats.
-        phase = 2 * np.pi * 1000.0 / 2718.0 * np.arange(14)
-        return [_at(z=deep + 0.02 * thick * shake) for shake in np.sin(phase)]
-    if motion == "slide":
-        aside = (0.0, 0.0, 0.1, 0.25, 0.45, 0.7, 0.2)
-        return [_at(x=x * wide, y=0.3 * x * wide, z=deep) for x in aside]
-    if motion == "tilt":
-        angles = (0.0, 0.2, 0.5, 0.9, 1.4, 1.4, -0.8)
-        return [_at(z=deep, angle=angle, about=(0.4, 1.0, 0.1)) for angle in angles]
-    if motion == "scribble":
-        random = np.random.default_rng(11)
-        reach = np.array([wide, high[1] - low[1], 2 * deep])
-        places = random.uniform(-0.5, 0.5, (8, 3)) * reach + [0.0, 0.0, deep]
-        return [Pose(place, random.standard_normal(4)) for place in places]
-    frames = [_at(z=deep), None, _at(z=0.5 * deep), LIFTED, _at(x=0.1 * wide, z=deep), None]
-    return [*frames, _at(z=deep)]  # flicker
+    top = mesh.nodes[mesh.nodes[:, 2] == low[2], :2]
+    nearest = top[np.argmin(np.linalg.norm(top - (low + high)[:2] / 2, axis=1))]
+    about = np.array([0.4, 1.0, 0.1]) / np.linalg.norm([0.4, 1.0, 0.1])
 
+    def at(z: float, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> Pose:
+        """Put it z m deep, x and y widths aside, turned by an angle."""
+        turn = np.append(np.sin(angle / 2) * about, np.cos(angle / 2))
+        return Pose(np.array([nearest[0] + x * wide, nearest[1] + y * wide, z]), turn)
 
-def _at(
-    x: float = 0.0,
-    y: float = 0.0,
-    z: float = 0.0,
-    angle: float = 0.0,
-    about: tuple[float, float, float] = (0.0, 0.0, 1.0),
-) -> Pose:
-    axis = np.array(about) / np.linalg.norm(about)
-    turn = np.append(np.sin(angle / 2) * axis, np.cos(angle / 2))
-    return Pose(np.array([x, y, z]), turn)
+    # 1 kHz at 2718 frames a second: no small multiple, so that no phase repeats.
+    shakes = 0.02 * thick * np.sin(2 * np.pi * 1000.0 / 2718.0 * np.arange(14))
+    stops = (-0.2 * thick, deep, 2.5 * thick, deep, -0.2 * thick, deep)
+    random = np.random.default_rng(11)
+    places = random.uniform(-0.5, 0.5, (8, 3)) * [wide, breadth, 2 * deep]
+    places += [*nearest, deep]
+    paths: dict[str, list[Pose | None]] = {
+        "press": [at(part * deep) for part in (0.2, 0.4, 0.6, 0.8, 1, 1, 1)],
+        "jump": [at(deep), at(deep), at(deep, x=0.2), at(0.3 * deep)],
+        "through": [at(z) for z in stops],
+        "tremor": [at(deep + shake) for shake in shakes],
+        "slide": [at(deep, x, 0.3 * x) for x in (0.0, 0.0, 0.1, 0.25, 0.45, 0.7, 0.2)],
+        "tilt": [at(deep, angle=angle) for angle in (0.0, 0.2, 0.5, 0.9, 1.4, 1.4, -0.8)],
+        "scribble": [Pose(place, random.standard_normal(4)) for place in places],
+        "flicker": [at(deep), None, at(0.5 * deep), LIFTED, at(deep, x=0.1), None, at(deep)],
+    }
+    return paths[motion]

@@ -26,7 +26,6 @@ from us_sim.evaluation.stability.cases import (
     model_of,
     poses_of,
 )
-from us_sim.evaluation.timing import frames_until
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
@@ -56,24 +55,19 @@ class Trial:
     @property
     def fault(self) -> str:
         """The first thing that went wrong; empty where nothing did."""
-        if not (self.failure or self.finite):
-            return "not finite"
-        if not (self.failure or self.bounded):
-            return "not bounded"
-        if self.failure or self.truthful:
+        if self.failure or (self.finite and self.bounded and self.truthful):
             return self.failure
+        if not (self.finite and self.bounded):
+            return "not bounded" if self.finite else "not finite"
         reported, checked = self.residual_reported, self.residual_checked
         return f"reported a residual of {reported:.3g}, but it is at least {checked:.3g}"
 
     @property
     def frames_to_balance(self) -> int | None:
         """Frames of the hold until the residual stays small; None where it never does."""
-        return frames_until(self.held, SMALL)
-
-    def say(self, actions: tuple[str, ...]) -> None:
-        """Add the actions that a solver reported of a frame."""
-        if actions and actions not in self.actions:
-            self.actions.append(actions)
+        large = [number for number, residual in enumerate(self.held) if not residual <= SMALL]
+        after = large[-1] + 1 if large else 0
+        return after if after < len(self.held) else None
 
 
 def try_case(method: str, case: StabilityCase) -> Trial:
@@ -116,7 +110,8 @@ def run_trial(solver: TissueSolver, forces: Forces, case: StabilityCase, trial: 
             trial.failure = f"raised {type(error).__name__} in frame {number}: {error}"
             return
         trial.slowest_ms = max(trial.slowest_ms, 1e3 * (time.perf_counter() - start))
-        trial.say(deformation.actions)
+        if deformation.actions and deformation.actions not in trial.actions:
+            trial.actions.append(deformation.actions)
         if not _finite(deformation):
             trial.finite = False
             return
@@ -137,9 +132,10 @@ def run_trial(solver: TissueSolver, forces: Forces, case: StabilityCase, trial: 
         if free < 0 and not failed and not model.fixed[deformation.contact_nodes].all():
             unbalanced, rounding, load = least_unbalanced(model, forces, deformation)
             heaviest = max(heaviest, load)
-            if heaviest > 0.0:  # to which a residual refers where less is pushed
-                reported = float(deformation.residual)
-                _compare(trial, reported, unbalanced / heaviest, rounding / heaviest)
+            if heaviest > 0.0 and trial.truthful:  # to which it refers where less is pushed
+                reported, checked = float(deformation.residual), unbalanced / heaviest
+                trial.truthful = agrees(reported, checked, rounding / heaviest)
+                trial.residual_reported, trial.residual_checked = reported, checked
         if free >= 0:
             trial.recovered_mm = 1e3 * away
             if away > 1e-4 * thickness:
@@ -198,9 +194,3 @@ def _bound(model: TissueModel, poses: list[Pose | None]) -> float:
     reach = max(float(np.linalg.norm(pose.position)) for pose in pressing)
     size = np.ptp(nodes, axis=0)
     return 3 * (float(np.linalg.norm(size)) + reach + 2 * float(box[2] + box[3]) + 0.1)
-
-
-def _compare(trial: Trial, reported: float, checked: float, rounding: float) -> None:
-    if trial.truthful:
-        trial.truthful = agrees(reported, checked, rounding)
-        trial.residual_reported, trial.residual_checked = reported, checked

@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from typing import Any
+from unittest.mock import patch
 
 import pandas as pd
 from threadpoolctl import threadpool_limits
@@ -22,7 +22,7 @@ from us_sim.evaluation.stability.cases import (
     sampled_cases,
 )
 from us_sim.evaluation.stability.measure import try_case
-from us_sim.evaluation.subject import Piece, Place, Report, Subject
+from us_sim.evaluation.subject import Piece, Report, Subject
 from us_sim.evaluation.tissue_methods import LOOKS, TISSUE_METHODS
 from us_sim.tissue.solvers.solver import create_solver
 
@@ -56,7 +56,8 @@ class Bench:
 
     def run(self, method: str, case: StabilityCase) -> Iterator[dict[str, Any]]:
         """Run a case."""
-        with threadpool_limits(1), _cache_in(self._cache.name):
+        cache = {"US_SIM_CACHE": self._cache.name}
+        with threadpool_limits(1), patch.dict(os.environ, cache):
             if method not in self._warm:  # so that no frame's time contains a compilation
                 create_solver(method, model_of(StabilityCase("box"))).warm_up()
                 self._warm.add(method)
@@ -83,24 +84,10 @@ _RAN = ("finite", "bounded", "recovered_mm", "residual_reported", "residual_chec
 """Columns of cases that were not refused."""
 
 
-@contextmanager
-def _cache_in(folder: str) -> Iterator[None]:
-    before = os.environ.get("US_SIM_CACHE")
-    os.environ["US_SIM_CACHE"] = folder
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["US_SIM_CACHE"]
-        else:
-            os.environ["US_SIM_CACHE"] = before
-
-
 def report_stability(rows: pd.DataFrame) -> Report:
     """Count what went wrong, and show the residuals over what makes a case hard."""
     failed = int((rows["failure"] != "").sum())
     held = rows[rows["held_residual"].notna()]
-    table = _count(rows)
     take_home = [
         f"{len(rows):,} cases, {failed} failed: a tissue that was not finite or bounded, whose "
         f"residual was not true, that was refused for no reason, or left out of balance."
@@ -115,35 +102,26 @@ def report_stability(rows: pd.DataFrame) -> Report:
                 f"0.001 under a held probe, in {inverted} with tetrahedra inside out"
                 f"{' (which would count as failed)' if method.is_judged_at_rest else ''}."
             )
-    ran = rows[~rows["refused"]]
+    ran = rows[~rows["refused"]].assign(softness=0.5 - rows["poisson_ratio"])
     labels = {"contrast": "contrast within the mesh", "softness": "0.5 - Poisson's ratio"}
     labels |= {"residual_checked": "residual under the probe", "recovered_mm": "mm from rest"}
-    places: dict[str, Place] = {
-        "counts": table,
-        "residual": draw_error_over_parameter(
-            *(ran, "contrast", "residual_checked", "Residual under the probe, as checked"),
+    figures = {
+        name: draw_error_over_parameter(
+            *(ran, x, y, title),
             panels="method",
             lines="method",
             looks=LOOKS,
             labels=labels,
             log="xy",
             join=False,
-            floor=1e-12,
-        ),
-        "recovery": draw_error_over_parameter(
-            ran.assign(softness=0.5 - ran["poisson_ratio"]),
-            *("softness", "recovered_mm", "Farthest from rest after release"),
-            panels="method",
-            lines="method",
-            looks=LOOKS,
-            labels=labels,
-            log="xy",
-            join=False,
-            floor=1e-6,
-        ),
-        "refusals": _refusals(rows[rows["refused"]]),
+            floor=floor,
+        )
+        for name, x, y, title, floor in (
+            ("residual", "contrast", "residual_checked", _CHECKED, 1e-12),
+            ("recovery", "softness", "recovered_mm", "Farthest from rest after release", 1e-6),
+        )
     }
-    return Report(take_home, places)
+    return Report(take_home, {"counts": _count(rows), **figures})
 
 
 def _count(rows: pd.DataFrame) -> pd.DataFrame:
@@ -167,15 +145,8 @@ def _count(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(counts)
 
 
+_CHECKED = "Residual under the probe, as checked"
 _LAWS = ("finite", "bounded", "truthful")
-
-
-def _refusals(refused: pd.DataFrame) -> pd.DataFrame:
-    """Each sentence once, though its numbers differ."""
-    sentence = refused["action"].str.partition("refused: ")[2]
-    alike = sentence.str.replace(r"\d[\d.e+-]*", "#", regex=True)
-    shown = refused[["case", "method"]].assign(sentence=sentence)
-    return shown[~alike.duplicated()]
 
 
 STABILITY = Subject(
