@@ -121,7 +121,7 @@ def test_what_is_waited_for_is_said_and_is_what_the_recorder_records(bench, path
     bench.spin_until(lambda: len(poses) == 10)
     assert not recorder.count_subscribers("/probe/pose")
     other = bench.make(PathPlayer, path=str(path), await_recorded=["probe/pose"])
-    other._awaited._since = 1e-9  # it waits for long
+    other._waiting_since = 0.0  # it waits for long
     bench.spin_until(lambda: "awaited" in other.health.values)
     assert "/probe/pose" in other.health.values["awaited"]
     assert {round(1e3 * pose.pose.position.z) for pose in poses[9:]} == {9}  # the first one holds

@@ -21,7 +21,7 @@ from rclpy.parameter import Parameter as RosParameter
 
 from us_sim.errors import SettingsError
 from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.parameters import Group, LiveSettings
+from us_sim.nodes.parameters import LiveSettings
 from us_sim.nodes.settings import TissueDeformerSettings
 from us_sim.settings.quantity import Quantity, dial_unit, units_of
 from us_sim.settings.registry import SOLVERS
@@ -192,7 +192,7 @@ def pages(bench: Bench) -> Iterator[Pages]:
 def console(bench: Bench, name: str = "console") -> Node:
     """A node of ours with settings that may change."""
     node = bench.add(Node(name, context=bench.context))
-    LiveSettings(node, {"imaging": Group(Imaging()), "colour": Group(ColourSettings(), "colour.")})
+    LiveSettings(node, {"imaging": Imaging(), "colour.": ColourSettings()})
     return node
 
 
@@ -211,7 +211,7 @@ def end(bench: Bench, node: Node) -> None:
 
 def test_a_node_of_ours_says_units_ranges_choices_and_meanings(bench, pages):
     node = console(bench)
-    LiveSettings(node, {"own": Group(TissueDeformerSettings(), "own.")})
+    LiveSettings(node, {"own.": TissueDeformerSettings()})
     known = pages.look_at("console").parameters
 
     def said(name: str, *fields: str) -> list[Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 from functools import partial
 from typing import Any
@@ -15,10 +14,9 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from us_sim.errors import TrackingError
 from us_sim.nodes.guarded_node import GuardedNode, Health
-from us_sim.nodes.mailbox import Mailbox
 from us_sim.nodes.messages import image_message, stamp_message
 from us_sim.nodes.parameters import declared
-from us_sim.nodes.process import run_node
+from us_sim.nodes.process import node_main
 from us_sim.nodes.settings import CameraDriverSettings
 from us_sim.share import full_path
 from us_sim.tracking.camera.model import CameraModel, read_camera_info
@@ -58,7 +56,7 @@ class CameraDriver(GuardedNode):
                 "us-sim calibrate camera and name it with the parameter camera_info"
             )
         self.health.state = "opening"
-        self._taken = Mailbox(self, self._publish, "camera")
+        self._take = self.newest_to(self._publish, "camera")
         self._ended = False
         self._closing = threading.Event()
         if self._video.is_file and not self._video.open():
@@ -139,7 +137,7 @@ class CameraDriver(GuardedNode):
         pixels = self._video.pixels(grey=self._encoding == "mono8")
         if pixels is None:
             return False
-        self._taken.put((stamp, pixels))
+        self._take((stamp, pixels))
         return True
 
     # In the node's thread.
@@ -186,8 +184,4 @@ def _info(
     return message
 
 
-main = partial(run_node, CameraDriver)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+main = node_main(CameraDriver, __name__)

@@ -8,24 +8,25 @@ import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType, ROSClock
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.subscription import Subscription
+from std_srvs.srv import Trigger
 
 from us_sim.errors import UsSimError, printable
 from us_sim.nodes import ros_refusal
 from us_sim.nodes.qos import EVERY, LATCHED, SENT, STREAM, overridable
 from us_sim.recording.decoding import nanoseconds_of
 
+T = TypeVar("T")
 CLOCK_S = 5.0  # for simulated time to begin, before it is said that it does not
 FAILED = "it failed; see the node's log"
 LONGEST = 500  # characters of a sentence: an error may quote all of a message
@@ -151,18 +152,12 @@ class GuardedNode(Node):
         self._due[kind] = now + wait, min(2 * wait, SAY_AT_LEAST_S)
         return True
 
-    def guarded(
-        self,
-        where: str,
-        callback: Callable[..., Any],
-        otherwise: Callable[..., Any] = lambda *_: None,
-    ) -> Callable[..., Any]:
+    def guarded(self, where: str, callback: Callable[..., Any]) -> Callable[..., Any]:
         """Return the callback, which raises no more, unless the node is being ended.
 
         Args:
             where: the service, or what else a person knows it by.
-            callback: takes what it takes.
-            otherwise: gives what is returned when the callback raises, from the same arguments.
+            callback: takes what it takes; None is returned when it raises.
         """
 
         @functools.wraps(callback)  # rclpy looks at its arguments
@@ -172,7 +167,7 @@ class GuardedNode(Node):
                 return callback(*arguments)
             except Exception as error:
                 self.report(where, error)
-                return otherwise(*arguments)
+                return None
 
         return call
 
@@ -197,28 +192,42 @@ class GuardedNode(Node):
         if self.executor is not None:  # else it has ended, or has not begun
             self.executor.create_task(self.guarded(where or _name(callback), callback))
 
-    def create_service(self, srv_type: Any, srv_name: str, callback: Any, **options: Any) -> Any:
-        """As `rclpy.node.Node.create_service`, guarded: a request that fails is told that."""
+    def newest_to(self, use: Callable[[T], None], where: str) -> Callable[[T], None]:
+        """Return a function by which a device's thread hands its newest value to the node's.
 
-        def refuse(_: Any, response: Any) -> Any:
-            if hasattr(response, "success") and hasattr(response, "message"):
-                response.success, response.message = False, FAILED
+        Args:
+            use: called with the value in the node's thread; one that is overtaken is dropped.
+            where: what a person knows the thread by.
+        """
+        newest: deque[T] = deque(maxlen=1)
+
+        def use_newest() -> None:
+            if newest:
+                use(newest.pop())
+
+        def put(value: T) -> None:
+            self.health.received += 1
+            self.health.dropped += len(newest)
+            newest.append(value)
+            self.call_soon(use_newest, where)
+
+        return put
+
+    def offer(self, name: str, act: Callable[[], str]) -> None:
+        """Offer a momentary command, which has no parameter, as the service ``~/name``.
+
+        Args:
+            name: below the node's own, of the type std_srvs/Trigger.
+            act: does it; returns why that cannot be, or nothing.
+        """
+
+        def answer(_: Any, response: Any) -> Any:
+            problem = self.guarded(f"service {name}", act)()
+            response.message = FAILED if problem is None else problem
+            response.success = problem == ""
             return response
 
-        call = self.guarded(f"service {srv_name}", callback, refuse)
-        return super().create_service(srv_type, srv_name, call, **options)
-
-    def add_on_set_parameters_callback(self, callback: Any) -> None:
-        """As `rclpy.node.Node.add_on_set_parameters_callback`; an exception refuses the change."""
-
-        def refuse(_: Any) -> SetParametersResult:
-            return SetParametersResult(successful=False, reason=FAILED)
-
-        super().add_on_set_parameters_callback(self.guarded("parameters", callback, refuse))
-
-    def add_post_set_parameters_callback(self, callback: Any) -> None:
-        """As `rclpy.node.Node.add_post_set_parameters_callback`, guarded."""
-        super().add_post_set_parameters_callback(self.guarded("parameters", callback))
+        self.create_service(Trigger, f"~/{name}", answer)
 
 
 class Queue:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +15,7 @@ from std_msgs.msg import Bool, Float64MultiArray
 
 from us_sim.errors import SceneError, StampError, UsSimError
 from us_sim.nodes.messages import contact_model_from, wrench_serialized
-from us_sim.nodes.process import run_node
+from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.recording.decoding import nanoseconds_of, pose_from
@@ -74,11 +72,7 @@ class PeriodicThread:
             self._late.append(time.monotonic_ns() - due)
 
 
-CHECKS, REPORTS = 5.0, 1.0
-"""Times a second that it is seen who listens, and that diagnostics are told how regular it is.
-
-The latter keeps the interpreter from rendering for two ticks.
-"""
+CHECKS = 5.0  # times a second that it is seen who listens
 
 
 class HapticRenderer(SceneNode):
@@ -89,7 +83,7 @@ class HapticRenderer(SceneNode):
     state tells, and grows slowly after it, as it does for whoever subscribes first.
     """
 
-    live_priority = 20  # its thread goes before other nodes; the kernel's are at 50
+    live_priority = 20  # its thread goes before other nodes; interrupts' are at 50
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("haptic_renderer", **kwargs)
@@ -105,10 +99,9 @@ class HapticRenderer(SceneNode):
         self.subscribe(Bool, "haptic/clutch", self._on_clutch, FOREIGN)
         self.subscribe(Float64MultiArray, "tissue/contact_model", self._on_model)
         self._thread = PeriodicThread(settings.rate, self.guarded("rendering", self._render))
+        self.health.measure = self._measure  # once a report: the jitter takes two ticks
         self._check_doubt()
-        self._report()
         self.create_timer(1.0 / CHECKS, self._check_doubt)
-        self.create_timer(1.0 / REPORTS, self._report)
         self._thread.start()
 
     def destroy_node(self) -> None:
@@ -171,8 +164,8 @@ class HapticRenderer(SceneNode):
         self._stops = stops
         self.health.state = f"zero: {doubt}" if doubt else "rendering"
 
-    def _report(self) -> None:
-        self.health.values = {
+    def _measure(self) -> dict[str, str]:
+        return {
             "stops": str(self._rendering.stops),
             "stopped": self._rendering.stopped,
             "jitter_p99_ms": f"{1e3 * self._thread.jitter:.3f}",
@@ -181,8 +174,4 @@ class HapticRenderer(SceneNode):
         }
 
 
-main = partial(run_node, HapticRenderer)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+main = node_main(HapticRenderer, __name__)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from functools import partial
 from pathlib import Path
@@ -15,7 +14,7 @@ from sensor_msgs.msg import Image
 from us_sim.errors import UsSimError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.parameters import declared
-from us_sim.nodes.process import run_node
+from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import EVERY
 from us_sim.nodes.settings import ImageWriterSettings
 from us_sim.recording.decoding import field_from, nanoseconds_of, pixels_from
@@ -77,8 +76,4 @@ def _made(name: str) -> Path:
     return folder
 
 
-main = partial(run_node, ImageWriter)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+main = node_main(ImageWriter, __name__)

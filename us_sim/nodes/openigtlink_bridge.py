@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +12,7 @@ from std_msgs.msg import Float64MultiArray
 
 from us_sim.errors import ProbeError
 from us_sim.nodes.parameters import declared
-from us_sim.nodes.process import run_node
+from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import OpenIGTLinkBridgeSettings
@@ -113,8 +111,4 @@ class OpenIGTLinkBridge(SceneNode):
             self.health.published(name)
 
 
-main = partial(run_node, OpenIGTLinkBridge)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+main = node_main(OpenIGTLinkBridge, __name__)

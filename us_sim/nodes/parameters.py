@@ -1,17 +1,11 @@
-"""Settings as ROS parameters: declared with unit and range, read, and changed while running.
-
-A number that need not be given is 0 in a parameter where it is not, such a list is one of zeros,
-and such a text is empty, since ROS parameters have no value for nothing.
-"""
+"""Settings as ROS parameters: declared with unit and range, read, and changed while running."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from array import array
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, TypeVar, get_args, get_origin
+from typing import Any, TypeVar, get_args
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -23,7 +17,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.settings import is_live
+from us_sim.nodes.settings import is_live, may_be_none, parameter_value, setting_value
 from us_sim.settings.quantity import dial_unit
 from us_sim.settings.setting import Settings, kinds_of, rules_of
 
@@ -52,24 +46,18 @@ def declared(node: Node, settings: S, names: Collection[str] | None = None, pref
     return changed(settings, given, prefix, f"{node.get_name()}.")
 
 
-@dataclass(frozen=True)
-class Group:
-    """Settings that are parameters together."""
-
-    settings: Settings  # the values by default
-    prefix: str = ""  # before the parameters' names
-    names: Collection[str] | None = None  # of the settings that are parameters; None is all
-
-
 class LiveSettings:
     """Settings of a node as parameters, some of which may change while it runs.
 
+    They have keys; one that ends with a dot goes before the names of its parameters.
+
     Args:
         node: that gets the parameters.
-        groups: by a name for each.
-        prepare: called with the settings of all groups, by the groups' names, before a change is
-            taken; what it raises refuses it.
+        settings: the values by default, by their keys.
+        check: called with all settings, by their keys, before a change is taken; what it raises
+            refuses it.
         use: called likewise when parameters have been set.
+        names: of those settings that are parameters, by key, where not all are.
 
     Raises:
         SettingsError: or the settings' own error: a value given at the start will not do.
@@ -78,24 +66,24 @@ class LiveSettings:
     def __init__(
         self,
         node: Node,
-        groups: Mapping[str, Group],
-        prepare: Callable[[dict[str, Any]], None] | None = None,
+        settings: Mapping[str, Settings],
+        check: Callable[[dict[str, Any]], None] | None = None,
         use: Callable[[dict[str, Any]], None] | None = None,
+        names: Mapping[str, Collection[str]] | None = None,
     ) -> None:
-        self._node, self._groups = node, groups
-        self._prepare, self._use = prepare, use
+        self._node, self._check, self._use = node, check, use
         self.values: dict[str, Any] = {
-            key: declared(node, group.settings, group.names, group.prefix)
-            for key, group in groups.items()
+            key: declared(node, given, (names or {}).get(key), _prefix(key))
+            for key, given in settings.items()
         }
         self._checked = self.values  # of the change that is about to be made
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._on_post_set)
 
     def restore(self, values: Mapping[str, Any]) -> None:
-        """Set parameters back to former settings, by the groups' names."""
+        """Set parameters back to former settings, by their keys."""
         back = [
-            Parameter(self._groups[key].prefix + name, value=_raw(settings, name))
+            Parameter(_prefix(key) + name, value=_raw(settings, name))
             for key, settings in values.items()
             for name in rules_of(type(settings))
             if getattr(settings, name) != getattr(self.values[key], name)
@@ -107,11 +95,11 @@ class LiveSettings:
         """Make the settings as they would be; what refuses that refuses the parameters."""
         try:
             checked = {
-                key: changed(settings, parameters, self._groups[key].prefix)
+                key: changed(settings, parameters, _prefix(key))
                 for key, settings in self.values.items()
             }
-            if checked != self.values and self._prepare is not None:
-                self._prepare(checked)
+            if checked != self.values and self._check is not None:
+                self._check(checked)
         except UsSimError as error:
             return SetParametersResult(successful=False, reason=str(error))
         self._checked = checked
@@ -123,6 +111,10 @@ class LiveSettings:
             self.values = self._checked
             if self._use is not None:
                 self._use(self.values)
+
+
+def _prefix(key: str) -> str:
+    return key if key.endswith(".") else ""
 
 
 def changed(settings: S, parameters: Sequence[Parameter], prefix: str = "", before: str = "") -> S:
@@ -139,7 +131,7 @@ def changed(settings: S, parameters: Sequence[Parameter], prefix: str = "", befo
     """
     values = {each.name: each.value for each in parameters}
     changes = {
-        name: _value(kind, values[prefix + name])
+        name: setting_value(kind, values[prefix + name])
         for name, kind in kinds_of(type(settings)).items()
         if prefix + name in values
     }
@@ -157,29 +149,8 @@ def parameters_with(settings: Settings) -> list[Parameter]:
     return [Parameter(name, value=_raw(settings, name)) for name in rules_of(type(settings))]
 
 
-def _value(kind: Any, raw: Any) -> Any:
-    """Convert a parameter's value to that of a setting of this type."""
-    if kind is str and isinstance(raw, int | float):
-        return str(raw)  # a camera's number, say
-    is_list = not isinstance(raw, str) and hasattr(raw, "__iter__")
-    if _may_be_none(kind) and not (any(raw) if is_list else raw):
-        return None
-    if get_origin(kind) is tuple and get_args(kind)[0] is str:
-        return tuple(text for text in raw or () if text)
-    return raw
-
-
 def _raw(settings: Settings, name: str) -> Any:
-    """Convert a setting's value to that of a parameter."""
-    value, kind = getattr(settings, name), kinds_of(type(settings))[name]
-    lists = [each for each in (kind, *get_args(kind)) if get_origin(each) is tuple]
-    if lists:
-        if get_args(lists[0])[0] is str:
-            return list(value) or [""]
-        return array("d", value or (0.0,))  # an empty list would have no type
-    if value is not None:
-        return value
-    return next({int: 0, float: 0.0}.get(each, "") for each in get_args(kind))
+    return parameter_value(kinds_of(type(settings))[name], getattr(settings, name))
 
 
 def _descriptor(settings: type[Settings], name: str) -> ParameterDescriptor:
@@ -197,7 +168,7 @@ def _descriptor(settings: type[Settings], name: str) -> ParameterDescriptor:
     meanings = rule.choice.in_short if rule.choice else {}
     if names := rule.choice.names if rule.choice else rule.choices:
         told["choices"] = {each: meanings.get(each, "") for each in names}
-    if _may_be_none(kind):
+    if may_be_none(kind):
         told["none"] = "" if str in get_args(kind) else 0
     descriptor = ParameterDescriptor(
         description=rule.description,
@@ -207,15 +178,11 @@ def _descriptor(settings: type[Settings], name: str) -> ParameterDescriptor:
     )
     if rule.quantity is not None:  # ROS has no range for lists
         low, high = rule.quantity.minimum, rule.quantity.maximum
-        kinds = get_args(kind) if _may_be_none(kind) else (kind,)
-        low = min(low, 0.0) if _may_be_none(kind) else low
+        kinds = get_args(kind) if may_be_none(kind) else (kind,)
+        low = min(low, 0.0) if may_be_none(kind) else low
         if float in kinds:
             descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
         elif int in kinds:
             whole = IntegerRange(from_value=int(low), to_value=int(high), step=1)
             descriptor.integer_range = [whole]
     return descriptor
-
-
-def _may_be_none(kind: Any) -> bool:
-    return type(None) in get_args(kind)

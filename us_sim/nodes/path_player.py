@@ -2,35 +2,39 @@
 
 from __future__ import annotations
 
-import sys
 import time
-from functools import partial
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
-from rclpy.timer import Timer
 from sensor_msgs.msg import Image
 
 from us_sim.errors import BagError
 from us_sim.nodes.messages import pose_message, stamp_message
-from us_sim.nodes.process import MEASURING, run_node
+from us_sim.nodes.process import MEASURING, node_main
 from us_sim.nodes.qos import EVERY, SENT
-from us_sim.nodes.sessions.playback import CHECK_S, Awaited, Player
-from us_sim.nodes.settings import PathPlayerSettings
+from us_sim.nodes.sessions.playback import Player
+from us_sim.nodes.settings import RECORDER, PathPlayerSettings
 from us_sim.recording.decoding import nanoseconds_of
 from us_sim.recording.path import ProbePath, read_path
 from us_sim.settings.spelling import counted
 
 HELD = 5.0
 """Poses a second of a probe that is held still; images are called stale after half a second."""
+CHECK_S, CHECKS = 0.05, 6
+"""How often it is looked, and how often in a row everything must be there before it begins.
+
+A best-effort subscriber may find a publisher a little later than it is found itself.
+"""
+TELL_AFTER_S = 5.0  # after so long it is said what is waited for
 
 
 class PathPlayer(Player):
-    """A bag's poses on ``tracker/pose``.
+    """A bag's poses on ``tracker/pose``, once the topics that its parameters name are there.
 
-    Its parameters are those of `PathPlayerSettings`.
+    Its parameters are those of `PathPlayerSettings`. What is waited for is said after a while, and
+    told in diagnostics as ``awaited``.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -42,16 +46,18 @@ class PathPlayer(Player):
         self.realtime_priority = 0 if lockstep else MEASURING
         self._stamps = _rising_stamps(self._path) if lockstep else self._path.stamps
         self._ages = self._path.log_times - self._path.log_times[0]  # ns
+        steps = np.diff(self._ages)
+        self._step = float(np.median(steps)) if len(steps) else 0.01e9  # ns, from pose to pose
         self.first, self.length = int(self._path.log_times[0]), int(self._ages[-1])
-        self._next, self._sent = 0, -1  # pose to be sent, and that which was sent last
-        self._begun = round(1e9 * settings.begun)  # ns
+        self._next = 0  # pose to be sent
         self._sent_at = 0.0  # s, of the monotonic clock
         self._poses = self.stream(PoseStamped, "tracker/pose", EVERY if lockstep else SENT)
         if lockstep:
             self.subscribe(Image, "ultrasound/image", self._on_image, EVERY)
-        self._awaited = Awaited(self, self._poses, settings)
+        self._checks, self._waiting_since = 0, time.monotonic()
         self.health.state = "waiting"
-        self._ticking = self._timer_at_its_pace()  # now, so that its thread goes first, too
+        # Now, so that its thread goes first, too.
+        self._ticking = self.create_timer(self._tick_s, self.play_on, clock=self.clock)
         self._ticking.cancel()
         self._starting = self.create_timer(CHECK_S, self._begin)
         self.pose_count = len(self._path)
@@ -61,52 +67,58 @@ class PathPlayer(Player):
         if self._path.note:
             self.get_logger().warning(self._path.note)
 
+    @property
+    def _tick_s(self) -> float:
+        """s from pose to pose as they are played."""
+        return float(max(1e-9 * self._step / self.settings.rate, 1e-4))
+
     def _begin(self) -> None:
-        if not self._awaited.has_come() or not self.now:
+        """Begin once everything has been there for a while."""
+        missing = self._missing()
+        self._checks = 0 if missing else self._checks + 1
+        told = self.health.values.get("awaited", "")
+        if missing not in ("", told) and time.monotonic() - self._waiting_since > TELL_AFTER_S:
+            self.health.values["awaited"] = missing
+            self.get_logger().warning(f"nothing is played yet: waiting for {missing}")
+        if self._checks < CHECKS or not self.now:
             return
         self._starting.cancel()
         self.health.state = "playing"
-        now = self.now
+        now, begun = self.now, round(1e9 * self.settings.begun)
         if self.settings.lockstep:
             self.has_begun = True
             self.head.hold(True, now)
             self.go_to(round(1e9 * self.settings.time))
             return
-        begun = self._begun if 0 < self._begun < now else now
-        self.go_to(round(1e9 * self.settings.time), begun)
-        self._skip(now)
+        self.go_to(round(1e9 * self.settings.time), begun if 0 < begun < now else now)
+        turn = int(self._ages[-1] + self._step)
+        if self.settings.loop and 0 < turn < self.head.position(now):  # round and round
+            self.head.go_to(self.head.position(now) % turn, now)
+        due = self._ages <= self.head.position(now) - 0.5 * self._step
+        self._next = min(int(due.sum()), self.pose_count - 1)
         self.get_logger().info(f"playing from pose {self._next}")
         self._ticking.reset()
         self.begin()
-        self._tick()
+        self.play_on()
 
-    def _timer_at_its_pace(self) -> Timer:
-        period = max(1e-9 * self._period, 1e-4)
-        timer: Timer = self.create_timer(period, self._tick, clock=self.clock)
-        return timer
+    def _missing(self) -> str:
+        """Return what is awaited and not there; nothing when all is."""
+        if not self._poses.get_subscription_count():
+            return f"somebody to subscribe to {self._poses.topic_name}"
+        for topic in map(self.resolve_topic_name, self.settings.await_topics):
+            if not self.count_publishers(topic):
+                return f"{topic} to be published"
+        for topic in map(self.resolve_topic_name, self.settings.await_recorded):
+            listeners = self.get_subscriptions_info_by_topic(topic)
+            if RECORDER not in {info.node_name for info in listeners}:
+                return f"{RECORDER} to subscribe to {topic}"
+        return ""
 
-    @property
-    def _period(self) -> float:
-        """ns from pose to pose as they are played."""
-        steps = np.diff(self._ages)
-        return float(np.median(steps)) / self.settings.rate if len(steps) else 0.01e9
-
-    def _skip(self, now: int) -> None:
-        """Go where the playhead is by now; round and round if the path loops."""
-        position = self.head.position(now)
-        turn = int(self._ages[-1] + self._period * self.settings.rate)
-        if self.settings.loop and 0 < turn < position:
-            self.head.go_to(position % turn, now)
-        due = self._ages <= self.head.position(now) - 0.5 * self._period * self.settings.rate
-        self._next = min(int(due.sum()), self.pose_count - 1)
-
-    def say_progress(self) -> None:
-        """Say how many poses were sent, also when the first was, and how far that is."""
-        self.health.values = {
+    def describe_progress(self) -> dict[str, str]:
+        """Return how many poses were sent, also when the first was, and how far that is."""
+        return super().describe_progress() | {
             "played": str(self._next),
             "begun": f"{1e-9 * self.head.begun(self.now):.9f}",
-            "position": f"{1e-9 * self.position:.3f}",
-            "duration": f"{1e-9 * self._ages[-1]:.3f}",
         }
 
     def use(self) -> None:
@@ -114,8 +126,9 @@ class PathPlayer(Player):
         if self.settings.lockstep:
             return
         if self.has_begun and self.settings.rate != self.head.rate:
-            self.destroy_timer(self._ticking)
-            self._ticking = self._timer_at_its_pace()
+            self._ticking.timer_period_ns = round(1e9 * self._tick_s)
+            self._ticking.reset()
+        self.gap = round(self._step / self.settings.rate)
         super().use()
 
     def go_to(self, position: int, at: int | None = None) -> None:
@@ -125,54 +138,45 @@ class PathPlayer(Player):
         if at is None:
             self._send(self._next)
 
-    def _tick(self) -> None:
+    def send_due(self) -> bool:
         """Send each pose whose time has come, to the nearest half period."""
-        if self.health.state == "finished":
-            if self.loops:
-                self.restart()
-            else:
-                self._hold(self._sent)
-            return
         if self.settings.paused:
-            self._hold(self._next)
-            return
-        while not self._is_over() and self._is_due():
+            self.hold()
+            return False
+        while not self._is_over and self._is_due:
             self._send(self._next)
             self._next += 1
-        self.say_progress()
-        if self._is_over():
-            self._begin_again_or_end()
+        return self._is_over
 
-    def _hold(self, pose: int) -> None:
+    def hold(self) -> None:
         """Say a few times a second that a probe which is held still is still there.
 
         Nothing ages while the player holds the clock, too.
         """
-        if pose < 0 or self.settings.clock:
-            return
-        if time.monotonic() - self._sent_at > 1.0 / HELD:
-            self._send(pose)
+        if not self.settings.clock and time.monotonic() - self._sent_at > 1.0 / HELD:
+            self._send(min(self._next, self.pose_count - 1))
 
+    @property
     def _is_over(self) -> bool:
         return self._next >= self.pose_count
 
+    @property
     def _is_due(self) -> bool:
-        half = 0.5 * self._period * self.settings.rate
-        return bool(self._ages[self._next] <= self.head.position(self.now) + half)
+        return bool(self._ages[self._next] <= self.head.position(self.now) + 0.5 * self._step)
 
     def _on_image(self, image: Image) -> None:
         stamp = nanoseconds_of(image.header.stamp)
         if self.health.state != "playing" or stamp != self._stamps[self._next]:
             return
         self._next += 1
-        self.say_progress()
-        if self._is_over():
-            self._begin_again_or_end()
+        self.health.values = self.describe_progress()
+        if self._is_over:
+            self.begin_again_or_end()
         if self.health.state == "playing":
             self._send(self._next)
 
     def _send(self, i: int) -> None:
-        self._sent, self._sent_at = i, time.monotonic()
+        self._sent_at = time.monotonic()
         if self.settings.lockstep:
             self.head.go_to(int(self._ages[i]), self.now)
         stamp = self.tell_time()
@@ -180,19 +184,6 @@ class PathPlayer(Player):
             stamp = stamp_message(int(self._stamps[i]))
         self._poses.publish(pose_message(self._path.pose(i), stamp, self._path.frame_id))
         self.health.published("tracker/pose")
-
-    def _begin_again_or_end(self) -> None:
-        if self.loops:
-            self.restart(gap=int(self._period))
-        else:
-            self.end()
-
-    def end(self) -> None:
-        """Hold the last pose, or be done."""
-        self.finish()
-        self.get_logger().info("the path is at its end")
-        if not self.settings.stay:
-            self.finished.set_result(None)
 
 
 def _rising_stamps(path: ProbePath) -> NDArray[np.int64]:
@@ -210,8 +201,4 @@ def _rising_stamps(path: ProbePath) -> NDArray[np.int64]:
     )
 
 
-main = partial(run_node, PathPlayer)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+main = node_main(PathPlayer, __name__)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 import time
-from functools import partial
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
@@ -13,7 +11,7 @@ from us_sim.errors import MessageError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import pose_message
 from us_sim.nodes.parameters import declared
-from us_sim.nodes.process import MEASURING, run_node
+from us_sim.nodes.process import MEASURING, node_main
 from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.scene_node import LEAD_TOPIC
 from us_sim.recording.decoding import twist_from, wrench_from
@@ -63,8 +61,4 @@ class ProbeRobot(GuardedNode):
         self.health.published(LEAD_TOPIC)
 
 
-main = partial(run_node, ProbeRobot)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+main = node_main(ProbeRobot, __name__)

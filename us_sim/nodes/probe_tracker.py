@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from functools import partial
 from typing import Any
 
 from builtin_interfaces.msg import Time as TimeMessage
@@ -19,8 +17,8 @@ from us_sim.nodes.messages import (
     surface_markers,
     transform_message,
 )
-from us_sim.nodes.parameters import Group, LiveSettings
-from us_sim.nodes.process import run_node
+from us_sim.nodes.parameters import LiveSettings
+from us_sim.nodes.process import node_main
 from us_sim.nodes.scene_node import poses_ended
 from us_sim.nodes.settings import ProbeTrackerSettings
 from us_sim.nodes.tf import TFMessage
@@ -63,12 +61,11 @@ class ProbeTracker(Device):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("probe_tracker", **kwargs)
         chosen = self.scene.tracker.filter
-        groups = {OWN: Group(ProbeTrackerSettings(filter=chosen.name))}
-        for name in FILTERS:
-            default = FILTERS.settings(name)()
-            given = chosen.given if chosen.name == name and chosen.given else default
-            groups[name] = Group(given, prefix=f"{name}.")
-        live = LiveSettings(self, groups, use=self._use)
+        given: dict[str, Any] = {f"{name}.": FILTERS.settings(name)() for name in FILTERS}
+        if chosen.given:
+            given[f"{chosen.name}."] = chosen.given
+        own = ProbeTrackerSettings(filter=chosen.name)
+        live = LiveSettings(self, {OWN: own, **given}, use=self._use)
         self._source = live.values[OWN].source or self.scene.tracker.source.name
         self._tracking = tracking_of(self.scene, _filter(live.values))
         self._state = TrackingState.WAITING
@@ -192,11 +189,7 @@ class ProbeTracker(Device):
 
 def _filter(values: dict[str, Any]) -> PoseFilter:
     name = values[OWN].filter
-    return create_filter(name, values[name])
+    return create_filter(name, values[f"{name}."])
 
 
-main = partial(run_node, ProbeTracker)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+main = node_main(ProbeTracker, __name__)

@@ -9,8 +9,8 @@ import os
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable, Collection
+from functools import partial
 from typing import Any
 
 import rclpy
@@ -84,9 +84,6 @@ def scheduling_of(pid: int) -> str:
     return "realtime" if policy == os.SCHED_RR else "ordinary"
 
 
-HELPLESS_S = 10.0
-"""A node in which nothing has worked for so long ends: then somebody can start it again."""
-
 TURN_S = 0.1
 """For a turn in which nothing comes: Python's handlers of signals run between turns, and without a
 limit the events executor would wait in a busy loop."""
@@ -156,6 +153,19 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     return _interrupted(node)
 
 
+def node_main(create: Callable[[], Node], module: str) -> Callable[..., int]:
+    """Return the function that runs a node; where its module is the program, run it and exit.
+
+    Args:
+        create: makes the node.
+        module: the ``__name__`` of the module whose ``main`` it is.
+    """
+    run = partial(run_node, create)
+    if module == "__main__":
+        sys.exit(run())
+    return run
+
+
 def create_executor(node: Node) -> Executor:
     """Return the executor that the node asks for, with the node."""
     executor: Executor = getattr(node, "executor_class", EventsExecutor)(context=node.context)
@@ -176,23 +186,18 @@ def spin(node: Node, executor: Executor) -> None:
 
     Raises:
         ExternalShutdownException: rclpy was shut down.
-        Exception: what rclpy raises, where nothing but that has happened for ten seconds.
     """
     finished = getattr(node, "finished", None)
-    worked = time.monotonic()
     try:
         while node.context.ok() and (finished is None or not finished.done()):
             if _told_to_end.is_set():
                 return
             try:
                 executor.spin_once(timeout_sec=TURN_S)
-                worked = time.monotonic()
             except ExternalShutdownException:
                 raise
             except Exception as error:
                 if not isinstance(node, GuardedNode) or not node.context.ok():
-                    raise
-                if time.monotonic() - worked > HELPLESS_S:
                     raise
                 node.failed("what came in", error)
     finally:

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import json
-import sys
 from array import array
 from collections.abc import Sequence
-from functools import partial
 from io import BytesIO
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from sensor_msgs.msg import CompressedImage, Image
-from std_srvs.srv import Trigger
 
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.parameters import declared
-from us_sim.nodes.process import run_node
+from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import EVERY
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import ScorerSettings
@@ -60,8 +57,8 @@ class Scorer(SceneNode):
         self.subscribe(WrenchStamped, "probe/wrench", self._on_wrench, EVERY)
         if self._live.lines:
             self.subscribe(Image, "ultrasound/labels", self._on_labels, newest=True)
-        self.create_service(Trigger, "~/clear", self._clear)
-        self.create_service(Trigger, "~/draw", self._draw)
+        self.offer("clear", self._clear)
+        self.offer("draw", self._draw)
         self.create_timer(1.0, self._tell)
         self.health.state = "following"
 
@@ -123,19 +120,17 @@ class Scorer(SceneNode):
         self.health.published("score/picture")
         return True
 
-    def _draw(self, _: Any, response: Any) -> Any:
+    def _draw(self) -> str:
         score = self._live.score()
-        response.success = score is not None and self._publish_picture(score[1])
-        response.message = "it is on score/picture" if response.success else "nothing was done yet"
-        return response
+        is_drawn = score is not None and self._publish_picture(score[1])
+        return "" if is_drawn else "nothing was done yet"
 
-    def _clear(self, _: Any, response: Any) -> Any:
+    def _clear(self) -> str:
         self._live.clear()
         self._poses, self._begin, self._measured = {}, 0, 0
         self._is_drawn = False
         self._picture.publish(CompressedImage())  # what was drawn is of before
-        response.success, response.message = True, "the score begins anew"
-        return response
+        return ""
 
 
 def _status_of(step: Step) -> DiagnosticStatus:
@@ -154,8 +149,4 @@ def _status_of(step: Step) -> DiagnosticStatus:
     )
 
 
-main = partial(run_node, Scorer)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+main = node_main(Scorer, __name__)

@@ -48,7 +48,7 @@ class SessionControl(GuardedNode):
     ) -> None:
         super().__init__("session_control", **kwargs)
         self._controlled = controlled
-        self._values = declared(self, SessionControlSettings())
+        self.values = declared(self, SessionControlSettings())  # present ones of the parameters
         self._is_showing = False
         self._told: tuple[object, ...] = ()
         self._player = cache(partial(AsyncParameterClient, self))
@@ -67,11 +67,6 @@ class SessionControl(GuardedNode):
             self.set_parameters_atomically(parameters_with(settings))
         finally:
             self._is_showing = False
-
-    @property
-    def values(self) -> SessionControlSettings:
-        """The present values of the parameters."""
-        return self._values
 
     def tell(self, state: str, values: Mapping[str, str], warning: str = "") -> None:
         """Report how things are; at once where more than the time in a replay has changed."""
@@ -136,7 +131,7 @@ class SessionControl(GuardedNode):
 
     def _wanted(self, parameters: list[Parameter]) -> SessionControlSettings:
         """A volume belongs to the scene that it was set with."""
-        wanted = changed(self._values, parameters)
+        wanted = changed(self.values, parameters)
         names = {each.name for each in parameters}
         if "scene" in names and "volume" not in names:
             wanted = changed(wanted, [Parameter("volume", value="")])
@@ -154,8 +149,8 @@ class SessionControl(GuardedNode):
 
     def _take(self, parameters: list[Parameter]) -> None:
         if self._is_showing:
-            self._values = changed(self._values, parameters)
+            self.values = changed(self.values, parameters)
             return
-        self._values = self._wanted(parameters)
-        self.show(self._values)
-        self._controlled.take(self._values, {each.name for each in parameters})
+        self.values = self._wanted(parameters)
+        self.show(self.values)
+        self._controlled.take(self.values, {each.name for each in parameters})

@@ -11,7 +11,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.qos import EVERY
 from us_sim.nodes.settings import RECORDER
-from us_sim.nodes.topics import published_counts
 
 TOLD = 50  # losses that a report tells one by one, the newest
 
@@ -47,7 +46,11 @@ class SessionMonitor(GuardedNode):
             self.heard[process] += 1
             if name == RECORDER and "file" in report:
                 self.recordings.setdefault(report["file"], process[1])
-            self._published[process] = published_counts(report)
+            self._published[process] = {
+                key.removeprefix("published "): _number(value)
+                for key, value in report.items()
+                if key.startswith("published ")
+            }
 
     def follow(self, nodes: Collection[str]) -> None:
         """Follow these nodes from now on."""

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import math
-import sys
 from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 from rclpy.exceptions import NameValidationException
@@ -13,7 +10,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from us_sim.errors import BagError
-from us_sim.nodes.process import run_node
+from us_sim.nodes.process import node_main
 from us_sim.nodes.sessions.playback import Player
 from us_sim.nodes.sessions.recorded_topic import message_type
 from us_sim.nodes.settings import SessionPlayerSettings
@@ -53,7 +50,6 @@ class SessionPlayer(Player):
             self.get_logger().warning(self.health.warning)
         if self._bag.note:
             self.get_logger().warning(self._bag.note)
-        self._damage: list[Fault] = []
         self._messages: Iterator[BagMessage] = iter(())
         self._waiting: BagMessage | None = None
         self._shown = -1  # of the recording, ns: until when it is shown while it is paused
@@ -81,88 +77,52 @@ class SessionPlayer(Player):
         if not self.now:
             return
         self._start.cancel()
-        self.restart()
-        if sought := round(1e9 * self.settings.time):
-            self.go_to(sought)
-        self.create_timer(0.002, self._tick)
+        self._play()
+        sought = round(1e9 * self.settings.time)
+        self.go_to(sought, None if sought else self.now)
+        self.create_timer(0.002, self.play_on)
         self.begin()
 
-    def _tick(self) -> None:
-        """Send the messages that are due."""
-        if self.health.state == "finished":
-            if self.loops:
-                self.restart()
-            return
+    def send_due(self) -> bool:
+        """Send the messages that are due; while it is paused only what is shown."""
         elapsed = self._shown
-        if not self.settings.paused:  # then nothing is sent by itself
+        if not self.settings.paused:
             elapsed = max(elapsed, self.head.position(self.now))
-        while self._waiting is not None and self._age() <= elapsed:
+        while self._waiting is not None and self._waiting.log_time - self.first <= elapsed:
             self._send(self._waiting)
-        self.say_progress()
-        if self._waiting is not None or self.settings.paused:
-            return
-        if self.loops:
-            self.restart()
-        else:
-            self.end()
-
-    def _age(self) -> float:
-        """ns from the start of the recording to the next message; infinite after the last."""
-        return self._waiting.log_time - self.first if self._waiting else math.inf
+        return self._waiting is None and not self.settings.paused
 
     def _send(self, message: BagMessage) -> None:
         self._topics[message.topic].publish(message.data)
         self.health.published(message.topic)
         self._waiting = self._next()
 
-    def end(self) -> None:
-        """Be done, unless it shall stay."""
-        self.finish()
-        if self.settings.stay:
-            return
-        if self._damage:
-            text = f"not all of the recording was played: {self._damage[0].text}"
-            self.finished.set_exception(BagError(text))
-        else:
-            self.finished.set_result(None)
-
-    def say_progress(self) -> None:
-        """Say how far it is."""
-        self.health.values = {
-            "position": f"{1e-9 * self.position:.3f}",
-            "duration": f"{1e-9 * self.length:.3f}",
-        }
-
     def go_to(self, position: int, at: int | None = None) -> None:
         """Have the messages from there on wait, and show a moment of them even if it is paused.
 
         The last of what is kept for those who come later is sent again.
         """
-        self._damage.clear()
+        self.damage.clear()
         since = self.first + position if position > 0 else None
         if since is not None:
             for message in self._bag.latest(self._latched, since, DEPTH):
                 self._topics[message.topic].publish(message.data)
-        self._messages = iter(self._bag.messages(list(self._topics), self._damage, since))
+        self._messages = iter(self._bag.messages(list(self._topics), self.damage, since))
         self._waiting = self._next()
         self._shown = position + _SHOWN if position and at is None else -1
         self.head.go_to(position, self.now if at is None else at)
 
     def _next(self) -> BagMessage | None:
         """The next message; damaged parts are reported, and skipped where possible."""
-        known = len(self._damage)
+        known = len(self.damage)
         try:
             message = next(self._messages, None)
         except BagError as error:
-            self._damage.append(Fault(str(error)))
+            self.damage.append(Fault(str(error)))
             message = None
-        for fault in self._damage[known:]:
+        for fault in self.damage[known:]:
             self.health.problem("damage", fault.text)
         return message
 
 
-main = partial(run_node, SessionPlayer)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+main = node_main(SessionPlayer, __name__)

@@ -6,7 +6,6 @@ import contextlib
 import functools
 import os
 import shutil
-import sys
 import time
 from collections import Counter
 from collections.abc import Mapping
@@ -21,11 +20,10 @@ from std_msgs.msg import String
 
 from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode, Health
-from us_sim.nodes.parameters import Group, LiveSettings
-from us_sim.nodes.process import let_receivers_go_first, let_signals_wait, run_node
+from us_sim.nodes.parameters import LiveSettings
+from us_sim.nodes.process import let_receivers_go_first, let_signals_wait, node_main
 from us_sim.nodes.sessions.attachments import session_attachments
 from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
-from us_sim.nodes.sessions.triggers import offer
 from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.nodes.topics import MARKERS, TOPICS
 from us_sim.recording.schemas import normalized_type, type_hash
@@ -55,9 +53,9 @@ class SessionRecorder(GuardedNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("session_recorder", **kwargs)
-        group = Group(SessionRecorderSettings())
-        self._live = LiveSettings(self, {"recorder": group}, use=lambda _: self._use())
-        settings = self._settings
+        live = LiveSettings(self, {"recorder": SessionRecorderSettings()}, use=self._use)
+        settings: SessionRecorderSettings = live.values["recorder"]
+        self._settings = settings
         self._is_wanted = functools.cache(
             lambda topic: settings.records(topic, self.get_namespace())
         )
@@ -66,44 +64,37 @@ class SessionRecorder(GuardedNode):
         self._attachments = session_attachments(settings)
         self._refused: set[tuple[str, str]] = set()  # topics of a type, as has been said
         self._topics: dict[str, RecordedTopic] = {}
-        self._types: dict[str, str] = {}
         self._told: Counter[str] = Counter()  # losses of which a person was told
         self._bag: WriteBehind | None = None  # None once it was stopped
         self._latched: dict[str, tuple[str, bytes, int, int]] = {}  # that came while it was paused
         self.health = Health(self, settings.file)
         self.health.measure = self._measure
         self._begin()
-        offer(self, "stop", self._stop)
+        self.offer("stop", self.stop)
         self.create_timer(0.1, self._discover)
         self.create_timer(1.0, self._follow_publishers)
 
-    @property
-    def _settings(self) -> SessionRecorderSettings:
-        settings: SessionRecorderSettings = self._live.values["recorder"]
-        return settings
-
-    def _use(self) -> None:
+    def _use(self, values: Mapping[str, SessionRecorderSettings]) -> None:
         """Pause or go on, as the parameter says."""
+        self._settings = values["recorder"]
         if self._bag is not None and not self._settings.paused:
             for kept in self._latched.values():
                 self._bag.put(*kept)
             self._latched.clear()
         self._tell_state()
 
-    def _stop(self) -> str:
+    def stop(self) -> str:
+        """End the recording: its file gets its index, and can be moved away.
+
+        Returns:
+            Why that cannot be, or nothing.
+        """
         if self._bag is None:
             return "nothing is recorded any more"
-        self.stop()
-        return ""
-
-    def stop(self) -> None:
-        """End the recording: its file gets its index, and can be moved away."""
-        for topic in self._topics.values() if self._bag is not None else ():
+        for topic in self._topics.values():
             with contextlib.suppress(Exception):  # what the rest raises must not cost what is there
                 topic.take_rest()
         bag, self._bag = self._bag, None
-        if bag is None:
-            return
         problem = ""
         try:
             bag.close()
@@ -114,6 +105,7 @@ class SessionRecorder(GuardedNode):
                 self.health.problem("disk", problem)
             self._tell_losses(bag)
             self._tell_state()
+        return ""
 
     def destroy_node(self) -> None:
         """Close the file, so that it has its index and metadata."""
@@ -164,7 +156,8 @@ class SessionRecorder(GuardedNode):
             if not self._is_wanted(topic):
                 continue
             for type_name in types:
-                if type_name == self._types.get(topic) or (topic, type_name) in self._refused:
+                known = self._topics.get(topic)
+                if (known and type_name == known.type_name) or (topic, type_name) in self._refused:
                     continue
                 try:
                     self._subscribe(topic, type_name)
@@ -173,16 +166,15 @@ class SessionRecorder(GuardedNode):
                     self.health.problem("topic", f"{topic} is not recorded: {error}")
 
     def _subscribe(self, topic: str, type_name: str) -> None:
-        cls = message_type(type_name)
-        if topic in self._types:
-            raise BagError(f"it is recorded as {self._types[topic]} and cannot be {type_name}, too")
+        if known := self._topics.get(topic):
+            raise BagError(f"it is recorded as {known.type_name} and cannot be {type_name}, too")
         offered = self._offered(topic, type_name)
         if not offered:
             return
+        recorded = RecordedTopic(self, topic, type_name, offered, self._take, self._lost)
         if self._bag is not None:
             self._bag.add_topic(topic, type_name, offered)
-        self._types[topic] = type_name
-        self._topics[topic] = RecordedTopic(self, topic, cls, offered, self._take, self._lost)
+        self._topics[topic] = recorded
 
     def _offered(self, topic: str, type_name: str) -> list[QoSProfile]:
         """Quality of service of the topic's publishers of that type."""
@@ -227,9 +219,9 @@ class SessionRecorder(GuardedNode):
 
     def _follow_publishers(self) -> None:
         for topic in self._topics.values():
-            new = topic.follow(self._offered(topic.name, self._types[topic.name]))
+            new = topic.follow(self._offered(topic.name, topic.type_name))
             if new and self._bag is not None:
-                self._bag.add_topic(topic.name, self._types[topic.name], new)
+                self._bag.add_topic(topic.name, topic.type_name, new)
         self.health.fault = "" if self._bag is None else self._bag.problem
         if self._bag is not None:
             self._tell_losses(self._bag)
@@ -268,17 +260,11 @@ def _load_types() -> None:
             type_hash(normalized_type(type_name))
 
 
-def main(args: list[str] | None = None) -> int:
-    """Record until interrupted."""
-
-    def create() -> SessionRecorder:
-        let_signals_wait()  # a file that is begun gets its end
-        node = SessionRecorder()
-        let_receivers_go_first()
-        return node
-
-    return run_node(create, args)
+def _create() -> SessionRecorder:
+    let_signals_wait()  # a file that is begun gets its end
+    node = SessionRecorder()
+    let_receivers_go_first()
+    return node
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+main = node_main(_create, __name__)

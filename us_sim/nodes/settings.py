@@ -7,12 +7,11 @@ anything is started; the tables of `docs/reference.md` are made from them.
 from __future__ import annotations
 
 import posixpath
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import get_args
+from typing import Any, get_args, get_origin
 
-from us_sim.errors import SettingsError, UsSimError
+from us_sim.errors import UsSimError
 from us_sim.nodes.topics import TOPICS
 from us_sim.scene.building import probe_of
 from us_sim.scene.scene import Scene
@@ -20,7 +19,7 @@ from us_sim.scoring.settings import ScoreSettings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import FILTERS, SOLVERS, TRACKERS
 from us_sim.settings.setting import Refusal, Settings, convert, kinds_of, rules_of, setting
-from us_sim.settings.spelling import nearest, unknown
+from us_sim.settings.spelling import unknown
 from us_sim.settings.text_files import YamlError, load_yaml
 from us_sim.settings.viewer import ViewerSettings
 from us_sim.skin.settings import MembraneSettings
@@ -60,26 +59,9 @@ class AnnotatedImageSettings(Settings):
     )
 
 
-def image_parameters(scene: Scene) -> Iterator[tuple[str, type[Settings]]]:
-    """Settings of a scene that are parameters, too, each with the prefix of their names."""
-    yield "", type(probe_of(scene))
-    yield "acoustics.", SoundSettings
-    for label in scene.imaging.acoustics.tissues:
-        yield f"{TISSUE_PARAMETERS}{label}.", TissueAcoustics
-    yield "m_mode.", type(scene.m_mode)
-    if scene.tissue is not None:
-        yield "strain.", type(scene.strain)
-    if scene.flows:
-        yield "colour.", type(scene.colour)
-        yield "spectrum.", type(scene.spectrum)
-    for name, flow in scene.flows.items():
-        yield f"flow.{name}.", type(flow)
-
-
 RECORDER, VIEWER = "session_recorder", "viewer"
 PLAYERS = ("path_player", "session_player")
 """Nodes that play what was recorded."""
-BEGUN = Quantity("time", 0.0, 1e10)  # when something began, since 1970
 _SPEED = Quantity("number", 0.01, 100.0)
 _SPAN = Quantity("time", 0.0, 1e6)
 _BYTES = Quantity("number", 0, 2**53)
@@ -138,7 +120,7 @@ class PathPlayerSettings(PlayerSettings):
         description="and session_recorder subscribes to each of these", default=()
     )
     begun: float = setting(
-        BEGUN,
+        Quantity("time", 0.0, 1e10),
         "since 1970, when the first pose was sent: play on where the path would be by now; 0: from "
         "the start",
         default=0.0,
@@ -222,11 +204,6 @@ class SessionRecorderSettings(Settings):
         if topic.endswith(OF_SIMULATORS):
             return among(*(each.name for each in TOPICS if not each.on_demand), *SHARED)
         return topic.startswith(posixpath.join(namespace, "")) or topic in SHARED
-
-    @property
-    def at_once(self) -> bool:
-        """Whether it records from its start, and not only when told to."""
-        return not self.paused
 
 
 @dataclass(frozen=True)
@@ -452,8 +429,6 @@ NODES: dict[str, tuple[type[Settings], ...]] = {
 _ROS_OWN = ("use_sim_time", "qos_overrides.", "start_type_description_service")
 """Parameters that rclpy itself declares, or prefixes of them."""
 
-_MOST_LISTED = 25  # parameters that a sentence names
-
 
 def is_live(settings: type[Settings], name: str) -> bool:
     """Whether a setting may change while the node runs."""
@@ -478,7 +453,18 @@ def parameters_of(node: str, scene: Scene | None = None) -> Iterator[tuple[str, 
     if scene is None:
         return
     if node == "slice_interpolator":
-        yield from image_parameters(scene)
+        yield "", type(probe_of(scene))
+        yield "acoustics.", SoundSettings
+        for label in scene.imaging.acoustics.tissues:
+            yield f"{TISSUE_PARAMETERS}{label}.", TissueAcoustics
+        yield "m_mode.", type(scene.m_mode)
+        if scene.tissue is not None:
+            yield "strain.", type(scene.strain)
+        if scene.flows:
+            yield "colour.", type(scene.colour)
+            yield "spectrum.", type(scene.spectrum)
+        for name, flow in scene.flows.items():
+            yield f"flow.{name}.", type(flow)
     if node == "tissue_deformer" and scene.tissue is not None:
         for solver in SOLVERS.importable:
             yield f"{solver}.", SOLVERS.settings(solver)
@@ -507,35 +493,56 @@ def checked_parameters(
         for name in rules_of(settings):
             if not of_probe or is_live(settings, name):
                 known.setdefault(prefix + name, (settings, name))
-    return {name: _checked(f"--param {node}.{name}", name, given[name], known) for name in given}
+    return {name: _checked(node, name, text, known) for name, text in given.items()}
 
 
 def _checked(
-    option: str, name: str, text: str, known: Mapping[str, tuple[type[Settings], str]]
+    node: str, name: str, text: str, known: Mapping[str, tuple[type[Settings], str]]
 ) -> object:
+    option = f"--param {node}.{name}"
     if name not in known and not name.startswith(_ROS_OWN):
-        if len(known) <= _MOST_LISTED or nearest(name, known):
-            raise UsSimError(f"{option}: {unknown(name, known)}")
-        node = option.split()[-1].partition(".")[0]
-        raise UsSimError(
-            f"{option}: is none of its {len(known)} parameters; `us-sim reference {node}` lists "
-            f"them"
-        )
+        raise UsSimError(f"{option}: {unknown(name, known)} (`us-sim reference {node}` says more)")
     try:
         value = load_yaml(text)
     except YamlError as error:
-        what = re.sub("^line [0-9]+: ", "", str(error))
-        raise UsSimError(f"{option}={text[:80]}: {what}") from error
+        raise UsSimError(f"{option}={text[:80]}: {error}") from error
     if name not in known:
         return value
     settings, field = known[name]
-    rule, kind = rules_of(settings)[field], kinds_of(settings)[field]
-    if kind is str and isinstance(value, int | float):
-        value = str(value)  # a camera's number, say
-    if type(None) in get_args(kind) and value in (None, 0, ""):
-        return next({int: 0, float: 0.0}.get(each, "") for each in get_args(kind))
+    kind = kinds_of(settings)[field]
     try:
-        made = convert(kind, value, rule)
-    except (Refusal, SettingsError) as refusal:
+        made = convert(kind, setting_value(kind, value), rules_of(settings)[field])
+    except Refusal as refusal:
         raise UsSimError(f"{option}: {refusal}") from refusal
-    return list(made) if isinstance(made, tuple) else made
+    return parameter_value(kind, made)
+
+
+def setting_value(kind: Any, raw: Any) -> Any:
+    """Convert a parameter's value to that of a setting of this type."""
+    if kind is str and isinstance(raw, int | float):
+        return str(raw)  # a camera's number, say
+    is_list = not isinstance(raw, str) and hasattr(raw, "__iter__")
+    if may_be_none(kind) and not (any(raw) if is_list else raw):
+        return None
+    if get_origin(kind) is tuple and get_args(kind)[0] is str:
+        return tuple(text for text in raw or () if text)
+    return raw
+
+
+def parameter_value(kind: Any, value: Any) -> Any:
+    """Convert the value of a setting of this type to that of a parameter.
+
+    ROS parameters have no value for nothing: a number that is not given is 0, such a list is one
+    of zeros, and such a text is empty. An empty list would have no type.
+    """
+    lists = [each for each in (kind, *get_args(kind)) if get_origin(each) is tuple]
+    if lists:
+        return list(value or ()) or ([""] if get_args(lists[0])[0] is str else [0.0])
+    if value is not None:
+        return value
+    return next({int: 0, float: 0.0}.get(each, "") for each in get_args(kind))
+
+
+def may_be_none(kind: Any) -> bool:
+    """Return whether a setting of this type need not be given."""
+    return type(None) in get_args(kind)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from functools import partial
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
@@ -12,8 +10,8 @@ from shape_msgs.msg import Mesh
 from visualization_msgs.msg import Marker
 
 from us_sim.nodes.messages import cloud_message, mesh_message, surface_marker
-from us_sim.nodes.parameters import Group, LiveSettings
-from us_sim.nodes.process import run_node
+from us_sim.nodes.parameters import LiveSettings
+from us_sim.nodes.process import node_main
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import SkinDeformerSettings
 from us_sim.recording.decoding import nanoseconds_of, pose_from
@@ -34,11 +32,13 @@ class SkinDeformer(SceneNode):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("skin_deformer", **kwargs)
         skin = self.scene.skin or SkinSettings()
-        membrane = Group(skin, "membrane.", rules_of(MembraneSettings))
         self._settings = LiveSettings(
-            self, {"markers": Group(SkinDeformerSettings()), "skin": membrane}, use=self._use
+            self,
+            {"markers": SkinDeformerSettings(), "membrane.": skin},
+            use=self._use,
+            names={"membrane.": rules_of(MembraneSettings)},
         )
-        self._membrane = membrane_of(self.scene, self._settings.values["skin"])
+        self._membrane = membrane_of(self.scene, self._settings.values["membrane."])
         surface = self._membrane.surface
         self._triangles = surface.triangles
         self._marked = 0
@@ -52,8 +52,8 @@ class SkinDeformer(SceneNode):
         self.get_logger().info("ready")
 
     def _use(self, values: dict[str, Any]) -> None:
-        if values["skin"] != self._membrane.settings:
-            self._membrane = self._membrane.with_settings(values["skin"])
+        if values["membrane."] != self._membrane.settings:
+            self._membrane = self._membrane.with_settings(values["membrane."])
 
     def failed(self, where: str, error: Exception) -> None:
         """Begin anew, too: the membrane may have been left halfway."""
@@ -92,8 +92,4 @@ class SkinDeformer(SceneNode):
         return True
 
 
-main = partial(run_node, SkinDeformer)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+main = node_main(SkinDeformer, __name__)

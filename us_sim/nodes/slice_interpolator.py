@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,8 +13,8 @@ from std_msgs.msg import Float64MultiArray, Int32MultiArray
 
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.messages import affine_message
-from us_sim.nodes.parameters import Group, LiveSettings
-from us_sim.nodes.process import run_node
+from us_sim.nodes.parameters import LiveSettings
+from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import is_live
@@ -24,27 +22,11 @@ from us_sim.nodes.streams import frame_streams
 from us_sim.nodes.streams.annotated_image import AnnotatedImage
 from us_sim.recording.decoding import nanoseconds_of, pose_from, tetrahedra_from, vectors_from
 from us_sim.scene.building import probe_of, scanner_of, skin_surface_of, volume_of
-from us_sim.scene.scene import Scene
 from us_sim.settings.setting import rules_of
 from us_sim.slicing.acoustics.settings import Acoustics, SoundSettings
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.settings import TISSUE_PARAMETERS, Imaging
-
-
-def _console_of(scene: Scene) -> dict[str, Group]:
-    """Return what a sonographer sets: of the probe, the image, and the sound, also by tissue."""
-    probe, imaging = probe_of(scene), scene.imaging
-    live = [name for name in rules_of(type(probe)) if is_live(type(probe), name)]
-    groups = {
-        "probe": Group(probe, names=live),
-        "imaging": Group(imaging, names=rules_of(Imaging)),
-        "acoustics": Group(imaging.acoustics, "acoustics.", rules_of(SoundSettings)),
-    }
-    for label, tissue in imaging.acoustics.tissues.items():
-        prefix = f"{TISSUE_PARAMETERS}{label}."
-        groups[prefix] = Group(tissue, prefix)
-    return groups
 
 
 def _together(values: dict[str, Any]) -> tuple[Probe, Imaging, Acoustics]:
@@ -53,7 +35,7 @@ def _together(values: dict[str, Any]) -> tuple[Probe, Imaging, Acoustics]:
         for key, value in values.items()
         if key.startswith(TISSUE_PARAMETERS)
     }
-    acoustics = dataclasses.replace(values["acoustics"], tissues=tissues)
+    acoustics = dataclasses.replace(values["acoustics."], tissues=tissues)
     return values["probe"], values["imaging"], acoustics
 
 
@@ -80,11 +62,7 @@ class SliceInterpolator(SceneNode):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("slice_interpolator", **kwargs)
         # Before the volume, which may take a minute to make.
-        console = LiveSettings(
-            *(self, _console_of(self.scene)),
-            prepare=lambda to: self._prepare(*_together(to)),
-            use=lambda to: self._use(*_together(to)),
-        )
+        console = self._declare_console()
         probe, imaging, acoustics = _together(console.values)
         volume = volume_of(self.scene)
         self._scanner = scanner_of(self.scene, volume, threads=self.threads)
@@ -118,6 +96,23 @@ class SliceInterpolator(SceneNode):
             self.subscribe(PointCloud2, "tissue/nodes", self._on_nodes, newest=True)
         self.health.state = "ready"
         self.get_logger().info("ready")
+
+    def _declare_console(self) -> LiveSettings:
+        """Declare what a sonographer sets: of probe, image and sound, also by tissue."""
+        probe, imaging = probe_of(self.scene), self.scene.imaging
+        tissues = imaging.acoustics.tissues.items()
+        return LiveSettings(
+            self,
+            {"probe": probe, "imaging": imaging, "acoustics.": imaging.acoustics}
+            | {f"{TISSUE_PARAMETERS}{label}.": tissue for label, tissue in tissues},
+            check=lambda to: self._prepare(*_together(to)),
+            use=lambda to: self._use(*_together(to)),
+            names={
+                "probe": [name for name in rules_of(type(probe)) if is_live(type(probe), name)],
+                "imaging": rules_of(Imaging),
+                "acoustics.": rules_of(SoundSettings),
+            },
+        )
 
     def _prepare(self, probe: Probe, imaging: Imaging, acoustics: Acoustics) -> None:
         self._scanner.prepare(probe, imaging, acoustics)
@@ -253,8 +248,4 @@ def _nanoseconds(message: PoseStamped | PointCloud2) -> int:
     return nanoseconds_of(message.header.stamp)
 
 
-main = partial(run_node, SliceInterpolator)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+main = node_main(SliceInterpolator, __name__)

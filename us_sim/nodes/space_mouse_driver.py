@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 from functools import partial
 from typing import Any
@@ -11,10 +10,9 @@ from sensor_msgs.msg import Joy
 
 from us_sim.errors import TrackingError
 from us_sim.nodes.guarded_node import GuardedNode, Health
-from us_sim.nodes.mailbox import Mailbox
 from us_sim.nodes.messages import stamp_message
 from us_sim.nodes.parameters import declared
-from us_sim.nodes.process import run_node
+from us_sim.nodes.process import node_main
 from us_sim.nodes.settings import SpaceMouseDriverSettings
 from us_sim.tracking.mouse import SpaceMouse
 
@@ -36,7 +34,7 @@ class SpaceMouseDriver(GuardedNode):
         self.health = Health(self, "SpaceMouse")
         self.health.state = "opening"
         self._joys = self.stream(Joy, "spacenav/joy")
-        self._moved = Mailbox(self, self._publish, "SpaceMouse")
+        self._take = self.newest_to(self._publish, "SpaceMouse")
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="space mouse", daemon=True)
         self._thread.start()
@@ -66,7 +64,7 @@ class SpaceMouseDriver(GuardedNode):
         while not self._closing.is_set():
             mouse.wait(self._patience)
             now = self.get_clock().now().nanoseconds
-            self._moved.put((now, mouse.name, mouse.axes, mouse.buttons))
+            self._take((now, mouse.name, mouse.axes, mouse.buttons))
 
     # In the node's thread.
 
@@ -84,8 +82,4 @@ class SpaceMouseDriver(GuardedNode):
         self.health.problem("device", problem)
 
 
-main = partial(run_node, SpaceMouseDriver)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+main = node_main(SpaceMouseDriver, __name__)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from builtin_interfaces.msg import Time as TimeMessage
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from numpy.typing import NDArray
@@ -28,8 +25,8 @@ from us_sim.nodes.messages import (
     tetrahedra_message,
     wrench_message,
 )
-from us_sim.nodes.parameters import Group, LiveSettings
-from us_sim.nodes.process import run_node
+from us_sim.nodes.parameters import LiveSettings
+from us_sim.nodes.process import node_main
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import StructureMarkersSettings, TissueDeformerSettings
 from us_sim.progress import late_progress
@@ -43,49 +40,12 @@ from us_sim.tissue.live_tissue import LiveTissue, TissueMethod
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import Deformation
 from us_sim.tissue.solvers.frame_budget import Pace, shortest
-from us_sim.tissue.solvers.solver import TissueSolver
 from us_sim.tracking.haptic import ContactModel, wrench_in_patient
 
 OWN = "tissue_deformer"
 STRUCTURES = "tissue/structures"
 PREPARED_CHECK_S = 0.1  # how often it is checked whether what was set is ready
 _MATERIALS = "materials."
-
-
-class ContactModelPublisher:
-    """``tissue/contact_model``: the wrench at a pose of the probe and how it changes from there.
-
-    Args:
-        node: that publishes it.
-    """
-
-    def __init__(self, node: SceneNode) -> None:
-        self._node = node
-        self._publisher = node.stream(Float64MultiArray, "tissue/contact_model")
-
-    @property
-    def is_wanted(self) -> bool:
-        """Whether somebody subscribes."""
-        return bool(self._publisher.get_subscription_count())
-
-    def publish(
-        self, solver: TissueSolver, pose: Pose, deformation: Deformation, stamp: TimeMessage
-    ) -> None:
-        """Publish the model at a pose, just solved for, under its stamp."""
-        wrench = wrench_in_patient(pose, deformation.force, deformation.torque)
-        try:
-            stiffness = solver.contact_stiffness()
-        except np.linalg.LinAlgError:
-            stiffness = None
-        try:
-            if stiffness is None:
-                stiffness = np.zeros((6, 6))
-            model = ContactModel(nanoseconds_of(stamp), pose, wrench, stiffness)
-        except TrackingError as error:
-            self._node.health.problem("contact_model", f"{error}; it is not published")
-            return
-        self._publisher.publish(contact_model_message(model))
-        self._node.health.published("tissue/contact_model")
 
 
 class StructureMarkers:
@@ -103,7 +63,7 @@ class StructureMarkers:
     def __init__(self, node: SceneNode, mesh: TetrahedralMesh) -> None:
         self._node = node
         self._mesh = mesh
-        self._settings = LiveSettings(node, {"markers": Group(StructureMarkersSettings())})
+        self._settings = LiveSettings(node, {"markers": StructureMarkersSettings()})
         self._publisher = node.stream(MarkerArray, STRUCTURES)
         self._structures: list[Structure] = []
         self._making: threading.Thread | None = None
@@ -144,7 +104,7 @@ class StructureMarkers:
         try:
             self._structures = list(structures_of(scene, volume_of(scene), self._mesh, triangles))
             for made in self._structures:
-                made.surface.carry(self._mesh.nodes)  # or a frame would compile its kernel
+                made.surface.carry(self._mesh.nodes)  # or a frame would compile it
         except UsSimError as error:
             self.state = str(error)
             self._node.health.problem("structures", f"{error}; no structure is shown")
@@ -161,7 +121,7 @@ class StructureMarkers:
         )
 
 
-ALWAYS = Time()  # the stamp of what does not change: zero, which tf takes as the latest
+ALWAYS = TimeMessage()  # the stamp of what does not change: zero, which tf takes as the latest
 GO_ON_S = 0.05
 """Time without a pose after which an unfinished frame is gone on with. It is longer than a frame:
 an executor serves timers before messages."""
@@ -172,8 +132,8 @@ VISIBLE_M = 5e-5
 class TissueDeformer(SceneNode):
     """``probe/pose`` in; ``tissue/nodes``, ``probe/wrench`` out; mesh latched.
 
-    ``tissue/contact_model`` too where a haptic arm needs it, see `ContactModelPublisher`, and
-    ``tissue/structures`` where the scene has structures, see `StructureMarkers`.
+    ``tissue/structures`` too where the scene has structures, see `StructureMarkers`, and for a
+    haptic arm ``tissue/contact_model``: the wrench at a pose and how it changes from there.
 
     Of a frame whose forces are not in balance, as on a computer with too little time, no wrench is
     sent, nor a contact model: it would be several times what the tissue exerts. Diagnostics count
@@ -193,21 +153,20 @@ class TissueDeformer(SceneNode):
         scene, section = self.scene, self.scene.tissue
         if section is None:
             raise SceneError(f"{scene.origin}: tissue: is missing, so nothing can deform")
-        groups = {OWN: Group(TissueDeformerSettings(solver=section.solver))}
+        given: dict[str, Any] = {OWN: TissueDeformerSettings(solver=section.solver)}
         for name in SOLVERS.importable:
-            given = section.settings.get(name) or SOLVERS.settings(name)()
-            groups[name] = Group(given, prefix=f"{name}.")
+            given[f"{name}."] = section.settings.get(name) or SOLVERS.settings(name)()
         for label, material in section.materials.items():
-            groups[_MATERIALS + label] = Group(material, prefix=f"{_MATERIALS}{label}.")
+            given[f"{_MATERIALS}{label}."] = material
         # Before the volume, which may take a minute to make.
-        self._settings = LiveSettings(self, groups, use=self._prepare)
+        self._settings = LiveSettings(self, given, use=self._prepare)
         self._used = dict(self._settings.values)  # what the tissue is deformed by
         self._tissue = self._make_tissue(_method_of(self._used))
         mesh = self._tissue.model.mesh
         self._nodes = self.stream(PointCloud2, "tissue/nodes")
         self._wrench = self.stream(WrenchStamped, "probe/wrench")
         is_felt = scene.tracker.source.name == "haptic"
-        self._contact = ContactModelPublisher(self) if is_felt else None
+        self._contact = self.stream(Float64MultiArray, "tissue/contact_model") if is_felt else None
         rest = self.latched(PointCloud2, "tissue/rest")
         tetrahedra = self.latched(Int32MultiArray, "tissue/tetrahedra")
         rest.publish(self._cloud(mesh.nodes, ALWAYS))
@@ -257,7 +216,8 @@ class TissueDeformer(SceneNode):
         method, own = _method_of(values), values[OWN]
         compared = f" compared with {own.compare_with}" if own.compare_with else ""
         changed = [key for key in values if values[key] != self._used[key]]
-        reason = ", ".join(f"{own.solver}{compared}" if key == OWN else key for key in changed)
+        named = [f"{own.solver}{compared}" if key == OWN else key[:-1] for key in changed]
+        reason = ", ".join(named)
         self._tissue.prepare(method, reason, wait=self.lockstep)
         now = f"{self._tissue.solver.name} goes on"
         self.get_logger().info(f"{reason}: being prepared; {now}" if reason else f"set back: {now}")
@@ -319,7 +279,7 @@ class TissueDeformer(SceneNode):
         return bool(
             self._nodes.get_subscription_count()
             or self._wrench.get_subscription_count()
-            or (self._contact is not None and self._contact.is_wanted)
+            or self._is_contact_wanted
             or (self._structures is not None and self._structures.is_due(stamp))
         )
 
@@ -335,10 +295,34 @@ class TissueDeformer(SceneNode):
                 wrench_message(deformation.force, deformation.torque, stamp, "probe")
             )
             self.health.published("probe/wrench")
-        if self._contact is not None and deformation.is_balanced and self._contact.is_wanted:
-            self._contact.publish(self._tissue.solver, pose, deformation, stamp)
+        if deformation.is_balanced and self._is_contact_wanted:
+            self._publish_contact_model(pose, deformation, stamp)
         if self._structures is not None and self._structures.is_due(stamp):
             self._structures.publish(deformation.nodes, stamp)
+
+    @property
+    def _is_contact_wanted(self) -> bool:
+        return self._contact is not None and self._contact.get_subscription_count() > 0
+
+    def _publish_contact_model(
+        self, pose: Pose, deformation: Deformation, stamp: TimeMessage
+    ) -> None:
+        """Publish the model at a pose, just solved for."""
+        assert self._contact is not None
+        wrench = wrench_in_patient(pose, deformation.force, deformation.torque)
+        try:
+            stiffness = self._tissue.solver.contact_stiffness()
+        except np.linalg.LinAlgError:
+            stiffness = None
+        try:
+            if stiffness is None:
+                stiffness = np.zeros((6, 6))
+            model = ContactModel(nanoseconds_of(stamp), pose, wrench, stiffness)
+        except TrackingError as error:
+            self.health.problem("contact_model", f"{error}; it is not published")
+            return
+        self._contact.publish(contact_model_message(model))
+        self.health.published("tissue/contact_model")
 
     def _describe(self, deformation: Deformation) -> None:
         if deformation.inverted:
@@ -399,10 +383,10 @@ class TissueDeformer(SceneNode):
 
 
 def _method_of(values: Mapping[str, Any]) -> TissueMethod:
-    """The method that the values of the node's parameters ask for, by their groups' names."""
-    label = len(_MATERIALS)
-    materials = {key[label:]: values[key] for key in values if key.startswith(_MATERIALS)}
-    settings = {name: values[name] for name in SOLVERS.importable}
+    """The method that the values of the node's parameters ask for, by their keys."""
+    begin = len(_MATERIALS)
+    materials = {key[begin:-1]: values[key] for key in values if key.startswith(_MATERIALS)}
+    settings = {name: values[f"{name}."] for name in SOLVERS.importable}
     own = values[OWN]
     return TissueMethod(own.solver, own.compare_with or "", settings, materials)
 
@@ -416,8 +400,4 @@ def _inside_out(deformation: Deformation, name: str) -> str:
     )
 
 
-main = partial(run_node, TissueDeformer)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+main = node_main(TissueDeformer, __name__)

@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,17 +53,3 @@ def read_topics() -> tuple[Topic, ...]:
 
 
 TOPICS = read_topics()
-
-
-def published_counts(report: Mapping[str, str]) -> dict[str, int]:
-    """Messages by topic that a node has published or recorded, by the values of its diagnostics.
-
-    >>> published_counts({"state": "imaging", "published ultrasound/image": "7"})
-    {'ultrasound/image': 7}
-    """
-    return {
-        topic: int(value) if value.isdecimal() and len(value) < 20 else 0
-        for key, value in report.items()
-        for kind, _, topic in [key.partition(" ")]
-        if kind == "published"
-    }

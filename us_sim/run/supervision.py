@@ -286,7 +286,7 @@ class Supervisor:
         files = [Path(file) for file, pid in recorded_by if (RECORDER, pid) in self._started]
         # How many images were to be recorded is only known where all that were made were.
         recorder = recorder_of(self.plan.processes)
-        all_were = recorder and recorder.at_once and recorder.records(self._images, namespace())
+        all_were = recorder and not recorder.paused and recorder.records(self._images, namespace())
         if files and all_were and self._changes == 1:
             made, recorded = node.count(IMAGER, IMAGES), images_in(files, self._images)
             if recorded < made:

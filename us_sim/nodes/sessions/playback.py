@@ -1,82 +1,24 @@
-"""Playing a recording: waiting for whoever needs it, rate, pause and place."""
+"""Playing a recording: rate, pause, place and end, as parameters say."""
 
 from __future__ import annotations
 
-import time
 from abc import abstractmethod
 from typing import Any
 
 from builtin_interfaces.msg import Time as TimeMessage
 from rclpy.clock import Clock
 from rclpy.parameter import Parameter
-from rclpy.publisher import Publisher
 from rclpy.task import Future
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import stamp_message
-from us_sim.nodes.parameters import Group, LiveSettings
-from us_sim.nodes.sessions.triggers import offer
-from us_sim.nodes.settings import RECORDER, PathPlayerSettings, PlayerSettings
+from us_sim.nodes.parameters import LiveSettings
+from us_sim.nodes.settings import PlayerSettings
 from us_sim.recording.playhead import Playhead
+from us_sim.recording.topic import Fault
 from us_sim.share import find_bag
-
-CHECK_S, CHECKS = 0.05, 6
-"""How often it is looked, and how often in a row everything must be there.
-
-A best-effort subscriber may find a publisher a little later than it is found itself.
-"""
-TELL_AFTER_S = 5.0  # after so long it is said what is waited for
-
-
-class Awaited:
-    """Waits for the topics that a path player's settings name, and for a subscriber.
-
-    After a while what is missing is said, and told in diagnostics as ``awaited``.
-
-    Args:
-        node: that plays.
-        publisher: to which somebody must have subscribed.
-        settings: of the node.
-    """
-
-    def __init__(
-        self, node: GuardedNode, publisher: Publisher, settings: PathPlayerSettings
-    ) -> None:
-        self._node, self._publisher, self._settings = node, publisher, settings
-        self._checks = 0
-        self._since = 0.0  # s, monotonic; when it was first looked
-        self._told = ""
-
-    def has_come(self) -> bool:
-        """Whether playing can begin; asked every `CHECK_S`."""
-        missing = self._missing()
-        self._checks = 0 if missing else self._checks + 1
-        if self._checks >= CHECKS:
-            self._node.health.values.pop("awaited", None)
-            return True
-        now = time.monotonic()
-        self._since = self._since or now
-        if missing and missing != self._told and now - self._since > TELL_AFTER_S:
-            self._told = self._node.health.values["awaited"] = missing
-            self._node.get_logger().warning(f"nothing is played yet: waiting for {missing}")
-        return False
-
-    def _missing(self) -> str:
-        """The first that is not there; nothing when all are."""
-        node = self._node
-        if not self._publisher.get_subscription_count():
-            return f"somebody to subscribe to {self._publisher.topic_name}"
-        for topic in self._settings.await_topics:
-            topic = node.resolve_topic_name(topic)
-            if not node.count_publishers(topic):
-                return f"{topic} to be published"
-        for topic in map(node.resolve_topic_name, self._settings.await_recorded):
-            listeners = node.get_subscriptions_info_by_topic(topic)
-            if RECORDER not in {info.node_name for info in listeners}:
-                return f"{RECORDER} to subscribe to {topic}"
-        return ""
 
 
 class Player(GuardedNode):
@@ -92,7 +34,7 @@ class Player(GuardedNode):
 
     def __init__(self, name: str, settings: PlayerSettings, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
-        self._live = LiveSettings(self, {"player": Group(settings)}, use=lambda _: self.use())
+        self._live = LiveSettings(self, {"player": settings}, use=lambda _: self.use())
         chosen = self.settings
         if not chosen.path:
             raise BagError(f"{name}'s parameter `path` is missing; name a bag to play")
@@ -101,15 +43,16 @@ class Player(GuardedNode):
         self.health = Health(self, str(self.path))
         self.head = Playhead(chosen.rate)
         self.first = self.length = 0  # ns: since 1970 when it was recorded, and how long it is
-        self.has_begun = self.is_stopped = False
+        self.gap = 0  # ns, from its end to its start where it loops
+        self.damage: list[Fault] = []  # found so far
+        self.has_begun = self._is_stopped = False
         self._latest = 0  # ns, of `now`
         self.clock = Clock() if chosen.clock else self.get_clock()
         if chosen.clock:
             self._clock_messages = self.stream(ClockMessage, "/clock")
             self.create_timer(1.0 / chosen.clock, self.tell_time)
         self.add_post_set_parameters_callback(self._seek)
-        if not getattr(chosen, "lockstep", False):
-            offer(self, "stop", self._stop)
+        self.offer("stop", self._stop)
 
     @property
     def settings(self) -> Any:
@@ -124,12 +67,18 @@ class Player(GuardedNode):
         """
 
     @abstractmethod
-    def say_progress(self) -> None:
-        """Put into the node's health how far it is."""
+    def send_due(self) -> bool:
+        """Send what is due; return whether it is at its end."""
 
-    @abstractmethod
-    def end(self) -> None:
-        """Be at the end."""
+    def hold(self) -> None:
+        """Do what is to be done while nothing moves."""
+
+    def describe_progress(self) -> dict[str, str]:
+        """Return how far it is, for diagnostics."""
+        return {
+            "position": f"{1e-9 * self.position:.3f}",
+            "duration": f"{1e-9 * self.length:.3f}",
+        }
 
     @property
     def now(self) -> int:
@@ -163,27 +112,44 @@ class Player(GuardedNode):
         """Go on at the rate that was set, or hold still; before it began there is nothing to do."""
         if not self.has_begun:
             return
-        settings = self.settings
-        self.head.run_at(settings.rate, self.now)
-        self.head.hold(settings.paused, self.now)
-        if self.health.state != "finished" or self.loops:
+        self.head.run_at(self.settings.rate, self.now)
+        self.head.hold(self.settings.paused, self.now)
+        if self.health.state != "finished" or self._loops:
             self._play()
         self._report()
 
+    def play_on(self) -> None:
+        """Send what is due, and at the end begin anew, or be done; called again and again."""
+        if self.health.state == "finished" and not self._loops:
+            self.hold()
+            return
+        is_over = self.health.state == "finished" or self.send_due()
+        self.health.values = self.describe_progress()
+        if is_over:
+            self.begin_again_or_end()
+
+    def begin_again_or_end(self) -> None:
+        """Play from the start on where it loops, else be done unless it shall stay."""
+        if self._loops:
+            self._play()
+            self.go_to(0, self.now + self.gap)
+        else:
+            self._end()
+
     @property
-    def loops(self) -> bool:
-        """Whether it begins again at the end."""
-        return bool(self.settings.loop) and not self.is_stopped
+    def _loops(self) -> bool:
+        return bool(self.settings.loop) and not self._is_stopped
 
-    def restart(self, gap: int = 0) -> None:
-        """Play from the start on, after a gap, ns."""
-        self._play()
-        self.go_to(0, self.now + gap)
-
-    def finish(self) -> None:
-        """Say that it is at its end."""
+    def _end(self) -> None:
         self.health.state = "finished"
         self._report()
+        if self.settings.stay:
+            return
+        if self.damage:
+            text = f"not all of the recording was played: {self.damage[0].text}"
+            self.finished.set_exception(BagError(text))
+        else:
+            self.finished.set_result(None)
 
     def _play(self) -> None:
         self.health.state = "paused" if self.settings.paused else "playing"
@@ -191,8 +157,8 @@ class Player(GuardedNode):
     def _stop(self) -> str:
         if not self.has_begun or self.health.state == "finished":
             return "nothing is played"
-        self.is_stopped = True
-        self.end()
+        self._is_stopped = True
+        self._end()
         return ""
 
     def _seek(self, parameters: list[Parameter]) -> None:
@@ -200,11 +166,11 @@ class Player(GuardedNode):
         times = [round(1e9 * each.value) for each in parameters if each.name == "time"]
         if not self.has_begun or not times:
             return
-        self.is_stopped = False
+        self._is_stopped = False
         self.go_to(times[-1])
         self._play()
         self._report()
 
     def _report(self) -> None:
-        self.say_progress()
+        self.health.values = self.describe_progress()
         self.health.report()

@@ -28,23 +28,26 @@ class RecordedTopic:
     Args:
         node: that subscribes.
         name: of the topic, in full.
-        message_type: class of its messages.
+        type_name: of its messages.
         offered: what its publishers offer.
         take: called with a serialized message and where it comes from.
         lost: called with a number of messages that did not come.
+
+    Raises:
+        BagError: the type is not known here.
     """
 
     def __init__(
         self,
         node: GuardedNode,
         name: str,
-        message_type: Any,
+        type_name: str,
         offered: Iterable[QoSProfile],
         take: Callable[[str, bytes, Mapping[str, Any]], None],
         lost: Callable[[str, int], None],
     ) -> None:
-        self.name = name
-        self._node, self._type = node, message_type
+        self.name, self.type_name = name, type_name
+        self._node, self._type = node, message_type(type_name)
         self._take, self._lost = take, lost
         profiles = [QosProfile.of(profile) for profile in offered]
         self._offered = dict.fromkeys(profiles)

@@ -6,7 +6,7 @@ Only those are there that a scene and its volume can provide.
 from __future__ import annotations
 
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.nodes.streams.stream import IMAGE, FrameStream, MModeStream
+from us_sim.nodes.streams.stream import IMAGE, FrameStream, m_mode_stream
 from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.strain import displacement
 from us_sim.volume.volume import Volume
@@ -30,7 +30,7 @@ def frame_streams(node: SceneNode, volume: Volume, probe: Probe) -> list[FrameSt
         from us_sim.nodes.streams.doppler import doppler_streams
 
         further += doppler_streams(node, volume)
-    further.append(MModeStream(node))
+    further.append(m_mode_stream(node))
     for stream in further:
         stream.prepare(probe)
     # Whoever waits for the images may begin when their topic is there, so it comes last.

@@ -14,7 +14,7 @@ from sensor_msgs.msg import Image
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.messages import image_message
-from us_sim.nodes.parameters import Group, LiveSettings
+from us_sim.nodes.parameters import LiveSettings
 from us_sim.nodes.scene_node import SceneNode, poses_ended
 from us_sim.nodes.settings import AnnotatedImageSettings
 from us_sim.nodes.streams.stream import FrameStream
@@ -42,25 +42,22 @@ class Age:
 
     def __init__(self, node: GuardedNode) -> None:
         self._node = node
-        self._came: tuple[int, int] | None = None  # ns, as `_now`
+        self._came: tuple[int, int] | None = None  # ns of ROS's time, and of one that nobody sets
 
     def restart(self) -> None:
         """Count from now on."""
-        self._came = self._now()
+        self._came = int(self._node.get_clock().now().nanoseconds), time.monotonic_ns()
 
     @property
     def seconds(self) -> float | None:
         """The age, s; None before the first has come."""
         if self._came is None:
             return None
-        now, came = self._now(), self._came
-        if came[0] > now[0]:  # time was set back, as when a bag starts again
-            self._came = came = now
-        return 1e-9 * min(now[0] - came[0], now[1] - came[1])
-
-    def _now(self) -> tuple[int, int]:
-        """ns of ROS's time, and of one that nobody sets."""
-        return int(self._node.get_clock().now().nanoseconds), time.monotonic_ns()
+        if self._node.get_clock().now().nanoseconds < self._came[0]:  # as when a bag starts again
+            self.restart()
+        ros, real = self._came
+        now = self._node.get_clock().now().nanoseconds
+        return 1e-9 * min(now - ros, time.monotonic_ns() - real)
 
 
 CHECKS = 5.0  # times a second that the age of the newest pose is looked at
@@ -98,9 +95,7 @@ class AnnotatedImage:
         self._overlays = {
             name: by_topic[mode.topic] for name, mode in OVERLAYS.items() if mode.topic in by_topic
         }
-        self._live = LiveSettings(
-            node, {"shown": Group(AnnotatedImageSettings())}, self._require_overlay
-        )
+        self._live = LiveSettings(node, {"shown": AnnotatedImageSettings()}, self._require_overlay)
         self._require_overlay(self._live.values)
         numbers = {name: number for number, name in label_names.items()}
         self._structures = {
@@ -116,11 +111,6 @@ class AnnotatedImage:
             node.create_timer(1.0 / CHECKS, self._check)
 
     @property
-    def _settings(self) -> AnnotatedImageSettings:
-        settings: AnnotatedImageSettings = self._live.values["shown"]
-        return settings
-
-    @property
     def is_wanted(self) -> bool:
         """Whether somebody subscribes."""
         return bool(self._publisher.get_subscription_count() > 0)
@@ -131,14 +121,16 @@ class AnnotatedImage:
         age = self._pose_age.seconds
         if age is None:
             return "waiting"
-        if self._node.lockstep or age <= self._settings.stale_after:
+        shown = self._live.values["shown"]
+        if self._node.lockstep or age <= shown.stale_after:
             return "live"
-        return "lost" if age > self._settings.lost_after else "stale"
+        return "lost" if age > shown.lost_after else "stale"
 
     def show_probe(self, probe: Probe) -> None:
         """The images that come are of another probe; those before it are not shown again."""
         self._probe = probe
-        self._annotation = Annotation(probe, self._structures, is_flipped=self._settings.flip)
+        is_flipped = self._live.values["shown"].flip
+        self._annotation = Annotation(probe, self._structures, is_flipped=is_flipped)
         self._frame: Frame | None = None
         self._labels: Pixels | None = None
         self._is_outlined = False
@@ -201,12 +193,12 @@ class AnnotatedImage:
         if self._frame is None or image_age is None:
             return Badge("NO IMAGE YET", _GREY)
         age = max(pose_age, image_age)  # an image may be made again at an old pose
-        if age <= self._settings.stale_after:
+        if age <= self._live.values["shown"].stale_after:
             return None
         return Badge(f"STALE {age:.1f} s", _AMBER)
 
     def _send(self, badge: Badge | None) -> None:
-        frame, overlay, shown = self._frame, None, self._settings
+        frame, overlay, shown = self._frame, None, self._live.values["shown"]
         if frame is None:
             image = np.zeros((self._probe.rows, self._probe.columns), np.uint8)
         else:
@@ -215,7 +207,7 @@ class AnnotatedImage:
             overlay = self._overlay(frame)
         if self._annotation.is_flipped != shown.flip:
             self._annotation = Annotation(self._probe, self._structures, is_flipped=shown.flip)
-        lines = [line for each in self._streams if each.is_wanted for line in each.lines]
+        lines = [line for each in self._streams if each.is_wanted for line in each.lines()]
         refine = None if frame is None else partial(onto_border, frame)
         picture = self._annotation.draw(image, self._labels, badge, overlay, lines, refine)
         if shown.beside:
@@ -234,7 +226,7 @@ class AnnotatedImage:
             self._node.health.problem("labels", f"{error}; nothing is outlined")
 
     def _overlay(self, frame: Frame) -> Overlay | None:
-        stream = self._overlays.get(self._settings.overlay)
+        stream = self._overlays.get(self._live.values["shown"].overlay)
         try:
             return stream.overlay(frame) if stream else None
         except UsSimError as error:

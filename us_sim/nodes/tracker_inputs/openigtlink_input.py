@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from functools import partial
 
-from us_sim.nodes.mailbox import Mailbox
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.openigtlink import OpenIGTLinkClient
@@ -19,7 +18,7 @@ class OpenIGTLinkInput(TrackerInput):
         super().__init__(device, settings)
         tracker = device.scene.tracker
         self._by_arrival = settings.clock == "arrival"
-        self._measured = Mailbox(device, device.take, f"{settings.host}:{settings.port}")
+        self._take = device.newest_to(device.take, f"{settings.host}:{settings.port}")
         self._client = OpenIGTLinkClient(settings, tracker.body, self._came, self._went_wrong)
 
     def close(self) -> None:
@@ -31,7 +30,7 @@ class OpenIGTLinkInput(TrackerInput):
     def _came(self, measurement: Measurement) -> None:
         if self._by_arrival or measurement.stamp == 0:
             measurement = dataclasses.replace(measurement, stamp=self._device.now())
-        self._measured.put(measurement)
+        self._take(measurement)
 
     def _went_wrong(self, kind: str, sentence: str) -> None:
         self._device.call_soon(partial(self._device.refuse, kind, sentence))
