@@ -1,6 +1,6 @@
 """Segmentation of a case: labels, surfaces and a picture.
 
-All of it is there at the end, or nothing is changed.
+All of it is made before the first of it is written, and each file is replaced whole.
 """
 
 from __future__ import annotations
@@ -17,11 +17,13 @@ from us_sim.errors import CaseError, VolumeError
 from us_sim.settings.spelling import aligned
 from us_sim.share import shared_roots
 from us_sim.volume.cases.case import LABELS, SURFACES, TISSUE, VOLUME, read_case
+from us_sim.volume.cases.proposal import with_proposal
 from us_sim.volume.cases.settings import RESERVED, CaseSettings, CaseStructure
-from us_sim.volume.cases.writing import changed_case, write_case_settings
+from us_sim.volume.cases.writing import write_case_settings
 from us_sim.volume.files.labels import read_labels
 from us_sim.volume.files.readers import read_volume
 from us_sim.volume.files.writing import write_labels
+from us_sim.volume.partial_file import partial_file
 from us_sim.volume.segmentation.settings import SegmentRequest, read_seeds
 from us_sim.volume.segmentation.structures import segment
 from us_sim.volume.structure_names import anatomical_colour
@@ -55,18 +57,19 @@ def segment_as_asked(asked: SegmentRequest, progress: Progress = lambda *_: None
     for number, (label, name) in enumerate(sorted(labels.names.items())):
         progress(0.8 + 0.1 * number / len(labels.names), f"surface of {name}")
         surfaces[name] = label_surface(volume, label)
-    with changed_case(asked.case) as folder:
-        if not _keeps_labels(asked):
-            write_labels(folder / LABELS, volume, labels.colours)
-            if (folder / TISSUE).exists():
-                (folder / TISSUE).unlink()
-                remarks.append(f"{TISSUE} was made of other labels and is removed")
-        write_case_settings(folder, settings)
-        shutil.rmtree(folder / SURFACES, ignore_errors=True)
-        (folder / SURFACES).mkdir()
-        for name, surface in surfaces.items():
-            write_stl(folder / SURFACES / f"{name}.stl", *surface)
-        draw_segmentation(volume, labels, folder / PICTURE)
+    settings, folder = with_proposal(settings, volume), case.folder
+    with partial_file(folder / PICTURE, PICTURE) as partial:
+        draw_segmentation(volume, labels, partial)
+    if not _keeps_labels(asked):
+        write_labels(folder / LABELS, volume, labels.colours)
+        if (folder / TISSUE).exists():
+            (folder / TISSUE).unlink()
+            remarks.append(f"{TISSUE} was made of other labels and is removed")
+    write_case_settings(folder, settings)
+    shutil.rmtree(folder / SURFACES, ignore_errors=True)
+    (folder / SURFACES).mkdir()
+    for name, surface in surfaces.items():
+        write_stl(folder / SURFACES / f"{name}.stl", *surface)
     progress(1.0, "")
     millilitres = 1e6 * abs(float(np.linalg.det(volume.index_to_patient[:3, :3])))
     rows = [_HEADING] + [

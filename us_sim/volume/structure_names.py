@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from functools import cache
 
 from us_sim.share import shared_path
+from us_sim.tissue.elasticity.material import kind_of
 
 _PHRASES = re.compile(r"\b(?:gr[ae]y|white) (?=matter\b)")
 
@@ -42,33 +43,26 @@ def readable(name: str) -> str:
 
 Colour = tuple[float, float, float]  # red, green and blue, 0 to 1
 
-_RED, _BLUE, _VIOLET, _BONE = (
-    (0.85, 0.15, 0.15),
-    (0.25, 0.4, 0.85),
-    (0.5, 0.3, 0.8),
-    (0.93, 0.9, 0.8),
-)
 _COLOURS: dict[str, Colour] = {
-    **dict.fromkeys(("artery", "aorta"), _RED),
-    **dict.fromkeys(("vein", "cava", "portal"), _BLUE),
-    **dict.fromkeys(("vessel", "vessels"), _VIOLET),
-    **dict.fromkeys(("bone", "rib"), _BONE),
+    "artery": (0.85, 0.15, 0.15),
+    "vein": (0.25, 0.4, 0.85),
+    "thrombus": (0.5, 0.3, 0.8),
+    "bone": (0.93, 0.9, 0.8),
     "nerve": (0.95, 0.85, 0.3),
     "fat": (0.95, 0.85, 0.6),
     "muscle": (0.75, 0.35, 0.3),
     "skin": (0.85, 0.7, 0.6),
     "liver": (0.6, 0.3, 0.2),
     "kidney": (0.7, 0.4, 0.3),
-    "gallbladder": (0.4, 0.6, 0.3),
-    "diaphragm": (0.7, 0.5, 0.5),
+    "fluid": (0.4, 0.6, 0.3),
 }
+"""By the kinds of tissue that names are of."""
 _ANY_OTHER: Colour = (0.7, 0.6, 0.55)
 
 
 def anatomical_colour(name: str) -> Colour:
-    """Return red, green and blue of a structure, by the last known word in its name."""
-    words = [word for word in re.split(r"[^a-z]+", name.lower()) if word in _COLOURS]
-    return _COLOURS[words[-1]] if words else _ANY_OTHER
+    """Return red, green and blue of a structure, by the kind of tissue that its name says."""
+    return _COLOURS.get(kind_of(name), _ANY_OTHER)
 
 
 _SHADES = (0.0, 0.45, 0.25, 0.65)  # part of white in the first, second, ... of one colour

@@ -99,7 +99,7 @@ def test_segments_in_layers_that_overlap_are_the_last_ones_and_that_is_said(tmp_
     assert read.names == {1: "artery", 2: "bone", 3: "vessel wall"}
     assert read.voxels == {"artery": 32, "vessel wall": 64, "bone": 1}
     assert read.colours[1] == (1.0, 0.0, 0.0)
-    assert any("artery and vessel wall overlap in 32 voxels" in said for said in read.remarks)
+    assert any("overlap in 32 voxels" in said for said in read.remarks)
     assert any("nerve: no voxel" in said for said in read.remarks)
     # Of old 3D Slicer: a layer each, and the value 1.
     fields = {"Segment0_Name": "vein", "Segment1_Name": "Bone"}

@@ -56,12 +56,6 @@ class Case:
         folder = self.folder / SURFACES
         return {file.stem: file for file in sorted(folder.glob("*")) if file.is_file()}
 
-    @property
-    def tissue(self) -> Path | None:
-        """The file of its tissue, where that has been made."""
-        file = self.folder / TISSUE
-        return file if file.is_file() else None
-
     def placement(self) -> tuple[NDArray[np.float64], tuple[int, int, int]]:
         """Where its voxels are, from the header alone: (4, 4) m from indices, and the shape.
 

@@ -1,7 +1,7 @@
-"""Making and changing case folders: all of a change is there, or nothing.
+"""Making case folders and changing their settings.
 
-A case is written into a folder beside its place, checked, and renamed; on any error that folder is
-removed.
+A new case is written into a folder beside its place, checked, and renamed; on any error that folder
+is removed. Of a case that is there each file is replaced whole.
 """
 
 from __future__ import annotations
@@ -40,30 +40,24 @@ def new_case(folder: str | os.PathLike[str]) -> Iterator[Path]:
         raise CaseError(f"{folder}: {problem}")
     if os.path.lexists(place):
         raise CaseError(f"{place}: exists already; choose another name, or remove it")
-    with _partial_folder(place) as partial:
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        partial = place.with_name(f".{place.name}.partial-{uuid.uuid4().hex}")
+        partial.mkdir()
+    except OSError as error:
+        raise CaseError(f"{place}: cannot be made: {error.strerror}") from error
+    try:
         yield partial
         _finish(place, partial)
-
-
-@contextmanager
-def changed_case(folder: str | os.PathLike[str]) -> Iterator[Path]:
-    """A copy of a case to change; it takes the case's place at the end, when it still is one.
-
-    Raises:
-        CaseError: there is no case, it cannot be copied, or what was written is none.
-    """
-    folder = read_case(folder).folder
-    with _partial_folder(folder, replaced=True) as partial:
-        try:
-            shutil.copytree(folder, partial, dirs_exist_ok=True)
-        except (OSError, shutil.Error) as error:
-            raise CaseError(f"{folder}: cannot be copied: {error}") from error
-        yield partial
-        _finish(folder, partial)
+        os.rename(partial, place)
+    except OSError as error:
+        raise CaseError(f"{place}: cannot be written: {error.strerror}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def write_case_settings(folder: Path, settings: CaseSettings) -> None:
-    """Write ``case.yaml`` into a folder of `new_case` or `changed_case`.
+    """Write ``case.yaml`` into the folder of a case; one that is there is replaced.
 
     Raises:
         CaseError: it cannot be written.
@@ -89,7 +83,8 @@ def write_constants_into(
         CaseError: there is no such case or structure, or it cannot be written.
         MaterialError: a constant is out of range.
     """
-    settings = read_case(folder).settings
+    case = read_case(folder)
+    settings = case.settings
     structures, around = dict(settings.structures), settings.around
     for name, changed in constants.items():
         if name not in (AROUND, *structures):
@@ -100,8 +95,7 @@ def write_constants_into(
         else:
             structures[name] = dataclasses.replace(structures[name], material=material)
     settings = dataclasses.replace(settings, around=around, structures=structures)
-    with changed_case(folder) as partial:
-        write_case_settings(partial, settings)
+    write_case_settings(case.folder, settings)
 
 
 def _finish(folder: Path, partial: Path) -> None:
@@ -119,32 +113,3 @@ def _finish(folder: Path, partial: Path) -> None:
             write_case_settings(partial, with_proposal(case.settings, case.volume()))
     except (CaseError, VolumeError) as error:
         raise type(error)(str(error).replace(str(partial), str(folder))) from error
-
-
-@contextmanager
-def _partial_folder(folder: Path, *, replaced: bool = False) -> Iterator[Path]:
-    """Make a folder to fill, which takes another's place at the end; on any error it is removed.
-
-    Raises:
-        CaseError: it cannot be made.
-    """
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        partial = folder.with_name(f".{folder.name}.partial-{uuid.uuid4().hex}")
-        partial.mkdir()
-    except OSError as error:
-        raise CaseError(f"{folder}: cannot be made: {error.strerror}") from error
-    before = partial.with_name(partial.name.replace(".partial-", ".before-"))
-    try:
-        yield partial
-        try:
-            if replaced:
-                os.rename(folder, before)
-            os.rename(partial, folder)
-        except OSError as error:
-            if before.exists():
-                os.rename(before, folder)
-            raise CaseError(f"{folder}: cannot be written: {error.strerror}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-        shutil.rmtree(before, ignore_errors=True)

@@ -3,14 +3,20 @@
 Only voxels, and their place and time, go on. The source is read, what lies outside its ultrasound
 regions is blanked, and the result is written anew: nothing is copied. Text that is burned into what
 is kept is not looked for.
+
+A scanner writes names, dates and hospitals around the echoes. Of its 2D images only the
+two-dimensional ultrasound regions of tissue and flow (PS3.3, C.8.5.5) are kept: grey bars,
+electrocardiograms, spectra and graphics are blanked with all that lies outside. Each region has a
+scale of its own.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,53 +25,82 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.settings.spelling import counted
 from us_sim.volume.deidentification.settings import ImportSettings, Rectangle
-from us_sim.volume.deidentification.source import (
-    Progress,
-    Scale,
-    Source,
-    dicom_source,
-    file_source,
+from us_sim.volume.files.dicom.header import (
+    DicomFile,
+    dicom_files,
+    groups_of,
+    is_dicom,
+    items,
+    number,
+    numbers,
+    refuse_other,
+    text,
 )
-from us_sim.volume.files.dicom.header import dicom_files, is_dicom, refuse_other
-from us_sim.volume.files.readers import ENDINGS
+from us_sim.volume.files.dicom.pixels import ImageFormat
+from us_sim.volume.files.dicom.placed_images import is_flat, opened_images, placed_images
+from us_sim.volume.files.dicom.planes import frame_times
+from us_sim.volume.files.readers import ENDINGS, open_image
+from us_sim.volume.files.segments import refuse_segments
+from us_sim.volume.files.stored_image import grey_voxels, volume_of_slices
 from us_sim.volume.files.writing import write_image_sequence, write_volume
 from us_sim.volume.partial_file import partial_file
 from us_sim.volume.volume import Volume
 
+Progress = Callable[[float, str], None]
+Scale = tuple[float, float]  # mm, width and height of a pixel
+
 _VOLUMES = (".nrrd", ".mha", ".nii", ".nii.gz")
+
+
+@dataclass(frozen=True)
+class Region:
+    """A region of echoes that a header states."""
+
+    part: Rectangle
+    pixel_mm: Scale | None  # None: its header does not state it
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Images of one volume or of one recording, as they come."""
+
+    shape: tuple[int, int, int]  # columns, rows, images
+    # (rows, columns) one after another; those pixels of each that are not kept are 0
+    images: Callable[[NDArray[np.bool_] | None], Iterator[NDArray[np.uint8]]]
+    conversions: tuple[str, ...]  # of the stored values
+    placement: NDArray[np.float64] | None  # (4, 4) m, from (column, row, image); None: no volume
+    regions: tuple[Region, ...] = ()  # of echoes, as the header says
+    doubt: str = ""  # why it states none, or is not believed
+    needs_part: bool = False  # images that may show a name outside the regions
+    times: Sequence[float] = ()  # s, of images that are no volume
+    pixel_mm: Scale | None = None  # of all of an image, where it is stated
 
 
 @dataclass(frozen=True, eq=False)
 class Import:
     """Files that were looked at, and the result that is planned."""
 
-    paths: list[Path]
+    path: Path  # the first of them
     out: Path | None
-    settings: ImportSettings
     source: Source
-    parts: tuple[Rectangle, ...]  # of every image, those that are kept; none: all of it
-    regions: tuple[Rectangle, ...]  # those of them that are ultrasound regions
+    part: Rectangle  # of every image that is cut out
+    regions: tuple[Rectangle, ...]  # all else in it becomes black; none: nothing does
     pixel_mm: Scale | None  # of images without a place
     undecided: str = ""  # what a person has to say before anything can be written
 
     @property
-    def what(self) -> str:
-        """The result, with its size, for a person."""
-        source, count = self.source, self.source.shape[2]
-        columns, rows = self.settings.part.size if self.settings.part else source.shape[:2]
-        if source.placement is None:
-            size = f"{columns} × {rows} pixels {_millimetres(self.pixel_mm)}"
-            return f"{counted(count, 'image')} of {size}"
-        steps = np.linalg.norm(source.placement[:3, :3], axis=0) * 1e3
-        apart = " × ".join(f"{step:.4g}" for step in steps)
-        return f"a volume of {columns} × {rows} × {count} voxels of {apart} mm"
-
-    @property
     def said(self) -> str:
         """What is made and blanked, and what nobody looked at, for a person."""
-        said = [self.what]
-        if self.settings.part:
-            said.append(f"all but columns and rows {self.settings.part} is cut off")
+        columns, rows, count = (*self.part.size, self.source.shape[2])
+        if self.source.placement is None:
+            size = f"{columns} × {rows} pixels {_millimetres(self.pixel_mm)}"
+            said = [f"{counted(count, 'image')} of {size}"]
+        else:
+            steps = np.linalg.norm(self.source.placement[:3, :3], axis=0) * 1e3
+            apart = " × ".join(f"{step:.4g}" for step in steps)
+            said = [f"a volume of {columns} × {rows} × {count} voxels of {apart} mm"]
+        if self.part.size != self.source.shape[:2]:
+            said.append(f"all but columns and rows {self.part} is cut off")
         if self.regions:
             listed = ", ".join(map(str, self.regions))
             said.append(f"everything outside the ultrasound regions {listed} is black")
@@ -80,15 +115,16 @@ class Import:
 
         It may show a name: it belongs where the original is kept.
         """
-        picture = np.asarray(cv2.cvtColor(self.source.first, cv2.COLOR_GRAY2BGR), np.uint8)
-        for box in self.parts:
+        first = next(self.source.images(None))
+        picture = np.asarray(cv2.cvtColor(first, cv2.COLOR_GRAY2BGR), np.uint8)
+        for box in self.regions or (self.part,):
             cv2.rectangle(picture, box[:2], box[2:], (80, 220, 80), 1)
         with partial_file(file) as partial:
             partial.touch(0o600)  # the owner's alone
             partial.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
 
     def write(self, progress: Progress | None = None) -> None:
-        """Write the result.
+        """Write the result: a sequence of images, a volume, or a case where the name has no ending.
 
         Raises:
             VolumeError: a person has to say first which part of the images is kept; or they cannot
@@ -97,46 +133,19 @@ class Import:
         """
         assert self.out is not None
         if self.undecided:
-            raise VolumeError(f"{self.paths[0]}: {self.undecided}")
+            raise VolumeError(f"{self.path}: {self.undecided}")
+        out, (columns, rows), count = self.out, self.part.size, self.source.shape[2]
         if self.source.placement is None:
-            self._write_images(self.out, progress)
-        else:
-            self._write_volume(self.out, self.source.placement, progress)
-
-    @property
-    def _keep(self) -> NDArray[np.bool_] | None:
-        """(rows, columns) of every image; None: all of it, since it is cut later."""
-        if not self.regions:
-            return None
-        keep = np.zeros(self.source.shape[1::-1], bool)
-        for part in self.regions:
-            keep[part.slices] = True
-        return keep
-
-    def _write_images(self, out: Path, progress: Progress | None) -> None:
-        """Write images without a place, one after another in time."""
-        source, part = self.source, self.settings.part
-        assert self.pixel_mm is not None
-        columns, rows, count = source.shape
-        part = part or Rectangle(0, 0, columns - 1, rows - 1)
-
-        def images() -> Iterator[NDArray[np.uint8]]:
-            assert source.images is not None
-            for number, image in enumerate(source.images(self._keep), start=1):
-                yield image[part.slices]
-                if progress:
-                    progress(number / count, f"{number} of {count} images")
-
-        shape = (count, *part.size[::-1])
-        write_image_sequence(out, images(), shape, source.times, self.pixel_mm)
-
-    def _write_volume(
-        self, out: Path, placement: NDArray[np.float64], progress: Progress | None
-    ) -> None:
-        """Write a volume as a file, or as a new case where the name has no ending."""
-        source, settings = self.source, self.settings
-        assert source.voxels is not None
-        volume = _cropped(source.voxels(self._keep, progress), placement, settings.part)
+            assert self.pixel_mm is not None
+            shape = (count, rows, columns)
+            images = self._images(progress)
+            write_image_sequence(out, images, shape, self.source.times, self.pixel_mm)
+            return
+        if min(columns, rows) < 2:
+            raise VolumeError(f"--crop {self.part}: a volume needs two columns and rows or more")
+        placement = self.source.placement.copy()
+        placement[:, 3] = placement @ [self.part.left, self.part.top, 0.0, 1.0]
+        volume = Volume(volume_of_slices(self._images(progress), count), placement)
         if out.name.lower().endswith(_VOLUMES):
             write_volume(out, volume)
             return
@@ -146,7 +155,20 @@ class Import:
         with new_case(out) as folder:
             write_volume(folder / "volume.nrrd", volume)
             del volume  # it is read again at the end, to propose where to start
-            write_case_settings(folder, CaseSettings(name=settings.name or out.name))
+            write_case_settings(folder, CaseSettings(name=out.name))
+
+    def _images(self, progress: Progress | None) -> Iterator[NDArray[np.uint8]]:
+        """Yield what is kept of each image."""
+        keep = None
+        if self.regions:
+            keep = np.zeros(self.source.shape[1::-1], bool)
+            for region in self.regions:
+                keep[region.slices] = True
+        count = self.source.shape[2]
+        for done, image in enumerate(self.source.images(keep), start=1):
+            yield image[self.part.slices]
+            if progress:
+                progress(done / count, f"{done} of {count} images")
 
 
 def look_at(
@@ -177,7 +199,7 @@ def look_at(
             f"{out}: its name ends as no volume's does; write {', '.join(_VOLUMES)}, .igs.mha for "
             f"2D images, or a folder's name without an ending for a case"
         )
-    return _planned(paths, out, settings, _source(paths, out, settings))
+    return _planned(paths[0], out, settings, _source(paths, out, settings))
 
 
 def _source(paths: list[Path], out: Path | None, settings: ImportSettings) -> Source:
@@ -186,19 +208,17 @@ def _source(paths: list[Path], out: Path | None, settings: ImportSettings) -> So
     if len(paths) == 1 and others:
         if len(spacing) == 2:
             raise VolumeError("--spacing: write three numbers for a volume: X,Y,Z")
-        return file_source(paths[0], settings.volume, spacing or None)
+        return _of_file(paths[0], settings.volume, spacing or None)
     if strange := [*others, *(path for path in paths if not is_dicom(path))]:
         raise refuse_other(
             strange[0],
             "is no DICOM file; give DICOM files of one series, or one MHA, NRRD or NIfTI volume",
         )
     needs_volume = out is not None and not out.name.lower().endswith(".mha")
-    return dicom_source(paths, settings.volume, spacing, needs_volume=needs_volume)
+    return _of_dicom(paths, settings.volume, spacing, needs_volume=needs_volume)
 
 
-def _planned(
-    paths: list[Path], out: Path | None, settings: ImportSettings, source: Source
-) -> Import:
+def _planned(path: Path, out: Path | None, settings: ImportSettings, source: Source) -> Import:
     """Find out what of every image is kept, and its scale."""
     columns, rows, _ = source.shape
     whole = Rectangle(0, 0, columns - 1, rows - 1)
@@ -223,11 +243,10 @@ def _planned(
     pixel: Scale | None = None
     if source.placement is None:
         try:
-            pixel = _scale(paths[0], source, part, settings.spacing_mm)
+            pixel = _scale(path, source, part, settings.spacing_mm)
         except ValueError as unknown:
             undecided.append(str(unknown))
-    parts = shown or ((part,) if settings.part else ())
-    return Import(paths, out, settings, source, parts, shown, pixel, "; ".join(undecided))
+    return Import(path, out, source, part, shown, pixel, "; ".join(undecided))
 
 
 def _scale(path: Path, source: Source, part: Rectangle, given: tuple[float, ...]) -> Scale:
@@ -258,14 +277,86 @@ def _millimetres(pixel: Scale | None) -> str:
     return f"{pixel[0]:.4g} × {pixel[1]:.4g} mm" if pixel else "of a size that is not stated"
 
 
-def _cropped(
-    voxels: NDArray[np.uint8], placement: NDArray[np.float64], part: Rectangle | None
-) -> Volume:
-    if part is None:
-        return Volume(voxels, placement)
-    if min(part.size) < 2:
-        raise VolumeError(f"--crop {part}: a volume needs two columns and rows or more")
-    rows, columns = part.slices
-    moved = placement.copy()
-    moved[:, 3] = placement @ [part.left, part.top, 0.0, 1.0]
-    return Volume(voxels[columns, rows], moved)
+def _of_file(path: Path, volume: int, spacing: tuple[float, ...] | None) -> Source:
+    """Open a MetaImage, NRRD or NIfTI volume, whose images are the slices along its last axis."""
+    image = open_image(path, layers=True, spacing=spacing)
+    refuse_segments(path, image.texts)
+    image.check(layers=False)
+    placement = image.placement()
+    voxels, conversions = grey_voxels(image, volume)
+    return Source(image.shape, lambda _: iter(voxels.transpose(2, 1, 0)), conversions, placement)
+
+
+def _of_dicom(
+    paths: Sequence[Path], volume: int, spacing: tuple[float, ...], *, needs_volume: bool
+) -> Source:
+    """Open the images of DICOM files of one series; refuse flat ones where a volume is needed."""
+    images = opened_images(paths)
+    first = images.files[0]
+    is_volume = needs_volume or not is_flat(images, spacing)
+    placed = placed_images(images, volume, spacing) if is_volume else None
+    if placed is None and len(paths) > 1:
+        raise VolumeError(f"{paths[0]}: and the other files are no volume; import each by itself")
+    which = placed.which if placed else images.all
+    conversions = list(images.conversions)
+    times = frame_times(first, images.form.frames)
+    if placed is None and times is None:
+        conversions.append("times of images are not stated: one every 40 ms is assumed")
+    if placed is not None and placed.volumes > 1:
+        conversions.append(f"volume {volume} of {placed.volumes} in time")
+    regions, doubt = _ultrasound_regions(first, images.form)
+    if any(_ultrasound_regions(file, images.form)[0] != regions for file in images.files):
+        regions, doubt = (), "the files have different ultrasound regions"
+    burned = any(text(file.header, "BurnedInAnnotation") == "YES" for file in images.files)
+    return Source(
+        (images.form.columns, images.form.rows, len(which)),
+        lambda keep: images.images(which, keep),
+        tuple(conversions),
+        placed.placement if placed else None,
+        regions,
+        doubt,
+        placed is None or burned,
+        [n * 0.04 for n in range(len(which))] if times is None else times,
+        _stated_scale(first),
+    )
+
+
+def _ultrasound_regions(file: DicomFile, form: ImageFormat) -> tuple[tuple[Region, ...], str]:
+    """Return the regions of echoes; none, with the reason, if one of the header's cannot be."""
+    kept = []
+    for region in items(file.header, "SequenceOfUltrasoundRegions"):
+        keys = ("MinX0", "MinY0", "MaxX1", "MaxY1")
+        found = [number(region, f"RegionLocation{key}") for key in keys]
+        edges = [-1 if each is None else int(each) for each in found]
+        # Some scanners write the first column beyond a region as its last.
+        ends = (form.columns - 1, form.rows - 1)
+        part = Rectangle(edges[0], edges[1], *map(min, edges[2:], ends))
+        is_within = edges[2] <= form.columns and edges[3] <= form.rows
+        if min(edges) < 0 or min(part.size) < 1 or not is_within:
+            doubt = f"a region is {edges} in an image of {form.columns} × {form.rows} pixels"
+            return (), doubt
+        kinds = number(region, "RegionSpatialFormat"), number(region, "RegionDataType")
+        if kinds in ((1, 1), (1, 2)):  # two-dimensional, of tissue or of colour flow
+            kept.append(Region(part, _region_scale(region)))
+    return tuple(kept), "" if kept else "there is no ultrasound region of tissue or flow"
+
+
+def _region_scale(region: Any) -> Scale | None:
+    units = number(region, "PhysicalUnitsXDirection"), number(region, "PhysicalUnitsYDirection")
+    x, y = number(region, "PhysicalDeltaX"), number(region, "PhysicalDeltaY")
+    if units != (3, 3) or not x or not y:  # centimetres
+        return None
+    return float(f"{abs(x) * 10.0:.7g}"), float(f"{abs(y) * 10.0:.7g}")
+
+
+def _stated_scale(file: DicomFile) -> Scale | None:
+    """Read `PixelSpacing`, or its counterpart in secondary captures."""
+    groups = groups_of(file.header, int(number(file.header, "NumberOfFrames") or 1))[0]
+    measures = (each for group in groups for each in items(group, "PixelMeasuresSequence"))
+    for source in (file.header, *measures):
+        # Between rows, then between columns (PS3.3, 10.7.1.3).
+        for key in ("PixelSpacing", "NominalScannedPixelSpacing"):
+            stated = numbers(source, key, 2)
+            if stated and all(1e-4 <= each <= 100.0 for each in stated):
+                return stated[1], stated[0]
+    return None

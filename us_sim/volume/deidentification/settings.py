@@ -61,10 +61,6 @@ class ImportSettings(Settings):
         description="X,Y,Z: mm between voxels, or X,Y between pixels, of files that do not say it",
         default=None,
     )
-    name: str | None = setting(
-        description="of a new case; never the patient's; not given: the name of its folder",
-        default=None,
-    )
 
     def check(self) -> None:
         """Refuse a crop that is no rectangle, and a spacing that is none."""

@@ -97,16 +97,15 @@ def _from_segments(
     keep = len(set(values)) == len(values) and min(values) > 0 and max(values) <= _MOST
     labels = np.zeros(layers.shape[1:], np.uint8)
     known: _Known = {}
+    overlap = 0
     for number, segment in enumerate(segments, start=1):
         label = segment.value if keep else number
         known[label] = (segment.name, segment.colour)
         inside = np.asarray(layers[segment.layer] == segment.value)
-        for other, both in zip(*np.unique(labels[inside], return_counts=True), strict=True):
-            if other:
-                one, two = _plain(known[int(other)][0], int(other)), _plain(known[label][0], label)
-                shared = counted(int(both), "voxel")
-                remarks.append(f"{one} and {two} overlap in {shared}, now of {two}")
+        overlap += int(np.count_nonzero(labels[inside]))
         labels[inside] = label
+    if overlap:
+        remarks.append(f"segments overlap in {counted(overlap, 'voxel')}, now of the later one")
     return labels, known
 
 

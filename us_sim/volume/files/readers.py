@@ -17,7 +17,7 @@ import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,6 +29,9 @@ from us_sim.volume.files.nifti import nifti_image
 from us_sim.volume.files.nrrd import nrrd_header, nrrd_image
 from us_sim.volume.files.stored_image import StoredImage, grey_voxels
 from us_sim.volume.volume import Volume
+
+if TYPE_CHECKING:
+    from us_sim.volume.files.dicom.placed_images import PlacedImages
 
 _READERS = {"mha": metaimage_image, "mhd": metaimage_image, "nrrd": nrrd_image, "nhdr": nrrd_image}
 _READERS |= {"nii": nifti_image, "hdr": nifti_image, "img": nifti_image}
@@ -53,10 +56,7 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
             or more along each axis, or has a spacing, origin or direction that places no volume.
     """
     path = Path(path)
-    if files := _dicom_files(path):
-        from us_sim.volume.files.dicom.placed_images import opened_images, placed_images
-
-        placed = placed_images(opened_images(files))
+    if placed := _placed_dicom(path):
         return Volume(placed.voxels(), placed.placement)
     image, placement = _placed(path)
     return Volume(grey_voxels(image)[0], placement)
@@ -65,11 +65,8 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
 def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
     """Read where a volume file's voxels are: (4, 4) from indices to m, from its header alone."""
     path = Path(path)
-    if files := _dicom_files(path):
-        from us_sim.volume.files.dicom.placed_images import opened_images, placed_images
-
-        return placed_images(opened_images(files)).placement
-    return _placed(path)[1]
+    placed = _placed_dicom(path)
+    return placed.placement if placed else _placed(path)[1]
 
 
 def open_image(
@@ -153,9 +150,11 @@ def _placed(path: Path) -> tuple[StoredImage, NDArray[np.float64]]:
     return image, image.placement()
 
 
-def _dicom_files(path: Path) -> list[Path]:
-    """The DICOM files that a path names; none where its name is that of another format."""
-    if path.is_dir():
-        return dicom_files(path)
+def _placed_dicom(path: Path) -> PlacedImages | None:
+    """The volume of DICOM files that a path names; None where its name is of another format."""
     named = path.name.lower().endswith(ENDINGS)
-    return [] if named or not path.is_file() or not is_dicom(path) else [path]
+    if not path.is_dir() and (named or not path.is_file() or not is_dicom(path)):
+        return None
+    from us_sim.volume.files.dicom.placed_images import opened_images, placed_images
+
+    return placed_images(opened_images(dicom_files(path) if path.is_dir() else [path]))

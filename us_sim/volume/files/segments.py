@@ -44,10 +44,8 @@ def segments_of(path: Path, pairs: Mapping[str, str]) -> list[Segment]:
     shared = any("LabelValue" in fields for fields in found.values())
     segments = []
     for at, (number, fields) in enumerate(sorted(found.items())):
-        value, layer = (
-            fields.get("LabelValue", "1"),
-            fields.get("Layer", "0" if shared else f"{at}"),
-        )
+        value = fields.get("LabelValue", "1")
+        layer = fields.get("Layer", "0" if shared else f"{at}")
         if not (value.isdecimal() and int(value) and layer.isdecimal()):
             raise VolumeError(
                 f"{path}: its Segment{number} has the LabelValue {shown(value)} and the Layer "
@@ -64,17 +62,13 @@ def segments_of(path: Path, pairs: Mapping[str, str]) -> list[Segment]:
     return segments
 
 
-def holds_segments(pairs: Mapping[str, str]) -> bool:
-    """Whether the keys of a header tell of segments, whatever their values are."""
-    return any(map(_FIELD.fullmatch, pairs))
-
-
-def no_grey_values(path: Path) -> VolumeError:
-    """The error of a segmentation where an image belongs."""
-    return VolumeError(
-        f"{path}: is a segmentation, which has labels and no grey values; give it to "
-        f"`us-sim segment CASE --labels {path.name}`"
-    )
+def refuse_segments(path: Path, pairs: Mapping[str, str]) -> None:
+    """Refuse a segmentation, by the keys of its header, where an image belongs."""
+    if any(map(_FIELD.fullmatch, pairs)):
+        raise VolumeError(
+            f"{path}: is a segmentation, which has labels and no grey values; give it to "
+            f"`us-sim segment CASE --labels {path.name}`"
+        )
 
 
 def _colour(text: str) -> Colour | None:

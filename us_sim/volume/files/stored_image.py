@@ -228,23 +228,14 @@ def grey_voxels(image: StoredImage, volume: int = 1) -> tuple[NDArray[np.uint8],
     return volume_of_slices(map(levels, slices()), stored.shape[2]), tuple(said)
 
 
-def volume_of_slices(
-    slices: Iterable[NDArray[np.uint8]],
-    count: int,
-    progress: Callable[[float, str], None] | None = None,
-) -> NDArray[np.uint8]:
-    """A volume (i, j, k) of slices (j, i).
+def volume_of_slices(slices: Iterable[NDArray[np.uint8]], count: int) -> NDArray[np.uint8]:
+    """A volume (i, j, k) of slices (j, i), of which so many come.
 
-    Args:
-        slices: in order; the first is read before memory is taken for all.
-        count: how many come.
-        progress: told the fraction that is there.
+    The first is read before memory is taken for all.
     """
     stack = np.empty(0, np.uint8)
     for k, image in enumerate(slices):
         if not k:
             stack = np.empty((count, *image.shape), np.uint8)
         stack[k] = image
-        if progress:
-            progress((k + 1) / count, f"{k + 1} of {count} images")
     return np.ascontiguousarray(stack.T)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,18 +35,9 @@ class PlacedImages:
     placement: NDArray[np.float64]  # (4, 4) m, from (column, row, image)
     volumes: int  # how many there are in time
 
-    def voxels(
-        self,
-        keep: NDArray[np.bool_] | None = None,
-        progress: Callable[[float, str], None] | None = None,
-    ) -> NDArray[np.uint8]:
-        """Read the grey values (i, j, k), a few images at a time.
-
-        Args:
-            keep: (rows, columns) the pixels of each image that are kept; the rest becomes 0.
-            progress: told the fraction that is read.
-        """
-        return volume_of_slices(self.images.images(self.which, keep), len(self.which), progress)
+    def voxels(self) -> NDArray[np.uint8]:
+        """Read the grey values (i, j, k), a few images at a time."""
+        return volume_of_slices(self.images.images(self.which), len(self.which))
 
 
 def opened_images(paths: Sequence[str | os.PathLike[str]]) -> GreyImages:
