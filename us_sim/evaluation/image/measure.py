@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from us_sim.evaluation.timing import medians_in_turn
 from us_sim.geometry.pose import Pose
@@ -60,9 +61,8 @@ def row_of(
 
 def tilted(degrees: float, *, elevational: bool = False) -> Pose:
     """A probe at the origin, turned about y in its image's plane, or about x out of it."""
-    half = 0.5 * np.radians(degrees)
-    axis = (np.sin(half), 0.0, 0.0) if elevational else (0.0, np.sin(half), 0.0)
-    return Pose(np.zeros(3), np.array([*axis, np.cos(half)]))
+    turn = Rotation.from_euler("x" if elevational else "y", degrees, degrees=True)
+    return Pose(np.zeros(3), turn.as_quat())
 
 
 def arm_images() -> dict[str, dict[str, NDArray[np.uint8]]]:
@@ -132,6 +132,5 @@ def run_time_rows(quick: bool) -> Iterator[dict[str, Any]]:
         )
     finally:
         cv2.setNumThreads(threads)
-    nan = float("nan")
     for name, ms in medians.items():
-        yield row_of(f"run_time_{name}", "linear", nan, nan, nan, ms, "ms")
+        yield row_of(f"run_time_{name}", "linear", np.nan, np.nan, np.nan, ms, "ms")

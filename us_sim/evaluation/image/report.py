@@ -18,7 +18,6 @@ ARTEFACTS: Mapping[str, Callable[[bool], Iterable[Mapping[str, Any]]]] = {
     "shadow_edge": shadow_rows,
     "run_time": run_time_rows,
 }
-"""By the first words of their rows."""
 
 
 def _pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:

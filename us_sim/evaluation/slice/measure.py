@@ -2,10 +2,6 @@
 
 That one tries every tetrahedron for every pixel, in float64. What it finds is held against linear
 algebra and SciPy in the tests.
-
->>> from us_sim.evaluation.slice.measure import SLICING_METHODS
->>> SLICING_METHODS[0]
-('scan_conversion', 1)
 """
 
 from __future__ import annotations

@@ -63,21 +63,13 @@ def _report(table: pd.DataFrame) -> Report:
         Target.at_most("time on 65,536 nodes over that on 2,000", 1.5, growth),
         Target.at_most("k in time ~ pixels^k", 1, power),
     ]
-    along = [
-        sizes.assign(across="pixels", count=sizes["size"] ** 2),
-        meshes.assign(across="nodes", count=meshes["nodes"]),
-    ]
-    counted = pd.concat(along)
-    worst = {
-        "coverage_mismatch_px": "sum",
-        "max_grey_difference": "max",
-        "mean_grey_difference": "max",
-        "max_voxel_error": "max",
-    }
-    errors = table.groupby(["method", "threads"], sort=False).agg(worst)
+    by_size = sizes.assign(across="pixels", count=sizes["size"] ** 2)
+    counted = pd.concat([by_size, meshes.assign(across="nodes", count=meshes["nodes"])])
+    errors = ["coverage_mismatch_px", "max_grey_difference", "max_voxel_error"]
+    worst = table.groupby(["method", "threads"], sort=False)[errors].max()
     places = {
         "table": main[["method", "threads", "ms_median", "ms_p99", "cpu_ms_median"]].join(
-            errors, on=["method", "threads"]
+            worst, on=["method", "threads"]
         ),
         "error": draw_error_over_time(
             sizes.assign(
