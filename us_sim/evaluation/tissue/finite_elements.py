@@ -48,7 +48,7 @@ class NeoHookeanHexahedra:
     incompressible elastic and inelastic analysis, Comput. Struct. 26, 1987). With J - 1 alone large
     elements are too stiff however far from the probe they lie: at Poisson's ratio 0.49
     displacements came out 3 % wrong. Meshes, shape functions and quadrature are scikit-fem's; its
-    loop over pairs of shape functions would assemble a stiffness in minutes, not seconds.
+    loop over pairs of shape functions takes 23 times as long for a stiffness (125 elements).
 
     Args:
         planes: m, ascending, of x, y and z.
