@@ -37,20 +37,6 @@ def test_long_work_draws_a_bar_to_its_end_and_later_work_another(clock, capsys):
         assert drawn.endswith("the rest\n")
 
 
-def test_what_nobody_knows_the_end_of_is_named_without_a_percentage(clock, capsys):
-    show = progress.late_progress("preparing the tissue")
-    for clock[0], text in ((0.0, "kernel 1"), (4.0, "kernel 2")):
-        show(0.0, f"compiling fem, {text}")
-    drawn = capsys.readouterr().err
-    assert "preparing the tissue" in drawn
-    assert "%" not in drawn
-    show(0.5, "compliance of the surface")
-    progress.end_late_bars()
-    drawn = capsys.readouterr().err
-    assert "preparing the tissue:  50 %" in drawn
-    assert drawn.endswith("compliance of the surface\n")
-
-
 def test_a_sentence_begins_on_a_line_of_its_own_below_a_bar_that_was_broken_off(
     clock, capsys, monkeypatch
 ):

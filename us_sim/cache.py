@@ -22,7 +22,6 @@ import json
 import logging
 import os
 import shutil
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +29,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 import platformdirs
-from filelock import FileLock, Timeout
+from filelock import FileLock
 from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
@@ -38,7 +37,6 @@ from us_sim.errors import UsSimError
 Thing = TypeVar("Thing")
 
 _DAMAGE = (OSError, EOFError, ValueError, TypeError, LookupError, AttributeError, UsSimError)
-_WAIT = 0.5  # s, between two words to the person who waits for another process
 
 _logger = logging.getLogger(__name__)
 
@@ -58,13 +56,8 @@ def cache_folder() -> Path:
     return Path(given) if given else platformdirs.user_cache_path("us_sim")
 
 
-def kept(
-    key: str,
-    form: Form[Thing],
-    make: Callable[[], Thing],
-    waiting: Callable[[], None] | None = None,
-) -> Thing:
-    """The thing kept under a key, made and kept first if it is not there.
+def kept(key: str, form: Form[Thing], make: Callable[[], Thing]) -> Thing:
+    """Return the thing kept under a key, made and kept first if it is not there.
 
     Where the cache folder cannot be written, the thing is made, used from memory, and a warning
     says so.
@@ -73,38 +66,24 @@ def kept(
         key: a file name that says all that decides the thing's bytes.
         form: how it is laid down.
         make: makes the thing; called by one process at a time.
-        waiting: called every half second while another process makes it.
     """
-    entry = cache_folder() / key
+    entry, made = cache_folder() / key, None
     found = _load(entry, form)
     if found is not None:
         return found
-    lock = FileLock(entry.with_name(f"{key}.lock"))
     try:
         entry.parent.mkdir(parents=True, exist_ok=True)
-        while not lock.is_locked:
-            try:
-                lock.acquire(timeout=_WAIT)
-            except Timeout:
-                if waiting is not None:
-                    waiting()
+        with FileLock(entry.with_name(f"{key}.lock")):
+            found = _load(entry, form, warn=True)
+            if found is None:
+                made = make()
+                _store(entry, form, made)
+                found = _load(entry, form)  # mapped: of no use is the copy in memory
     except OSError as error:
-        _logger.warning("%s cannot be written (%s), so nothing is kept there", entry.parent, error)
-        return make()
-    try:
-        found = _load(entry, form, warn=True)
-        if found is not None:
-            return found
-        made = make()
-        try:
-            _store(entry, form, made)
-        except OSError as error:
-            _logger.warning("%s cannot be written (%s), so it is not kept", entry, error)
-            return made
-        found = _load(entry, form, warn=True)
-        return made if found is None else found
-    finally:
-        lock.release()
+        _logger.warning("%s cannot be written (%s), so it is not kept", entry, error)
+    if found is not None:
+        return found
+    return make() if made is None else made
 
 
 def _load(entry: Path, form: Form[Thing], *, warn: bool = False) -> Thing | None:
@@ -115,7 +94,7 @@ def _load(entry: Path, form: Form[Thing], *, warn: bool = False) -> Thing | None
         facts = json.loads((entry / form.description).read_text(encoding="utf-8"))
         # Mapped, so that only what is used takes memory; and a plain array over the map, since a
         # subclass would slow and surprise callers.
-        files = sorted(entry.glob("*.npy"))
+        files = entry.glob("*.npy")
         arrays = {file.stem: np.asarray(np.load(file, mmap_mode="r")) for file in files}
         return form.unpack(arrays, facts)
     except _DAMAGE as error:
@@ -126,19 +105,15 @@ def _load(entry: Path, form: Form[Thing], *, warn: bool = False) -> Thing | None
 
 def _store(entry: Path, form: Form[Thing], thing: Thing) -> None:
     """Write an entry; the caller holds its lock."""
-    for left_over in entry.parent.glob(f"{entry.name}.partial-*"):
-        shutil.rmtree(left_over, ignore_errors=True)
-    partial = Path(tempfile.mkdtemp(prefix=f"{entry.name}.partial-", dir=entry.parent))
+    partial = entry.with_name(f"{entry.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)  # of a process that was killed
     try:
+        partial.mkdir()
         arrays, facts = form.pack(thing)
         for name, array in arrays.items():
             np.save(partial / f"{name}.npy", array)
-        description = json.dumps(facts, indent=1)
-        (partial / form.description).write_text(description, encoding="utf-8")
-        if entry.is_dir():
-            shutil.rmtree(entry)
-        elif entry.exists():
-            entry.unlink()
+        (partial / form.description).write_text(json.dumps(facts, indent=1), encoding="utf-8")
+        shutil.rmtree(entry, ignore_errors=True)  # damaged
         partial.rename(entry)
     finally:
         shutil.rmtree(partial, ignore_errors=True)

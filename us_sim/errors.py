@@ -17,18 +17,6 @@ def printable(text: str, longest: int = LONGEST) -> str:
     return "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in cut)
 
 
-def memory_limit() -> str:
-    """How much memory a process may take here, for a person; nothing where that is not limited."""
-    try:
-        import resource
-    except ImportError:  # not on Windows
-        return ""
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit == resource.RLIM_INFINITY:
-        return ""
-    return f"a process may take {limit / 1e6:.0f} MB of memory (ulimit -v), which may be too little"
-
-
 class UsSimError(Exception):
     """Base of every error that this package raises for bad input."""
 

@@ -20,7 +20,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from us_sim.errors import UsSimError, memory_limit
+from us_sim.errors import UsSimError
 from us_sim.nodes import INTERRUPTED, ros_refusal
 from us_sim.nodes.guarded_node import GuardedNode
 
@@ -135,8 +135,7 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     except (UsSimError, ParameterException) as error:
         return _refused(error)
     except MemoryError:
-        told = ["there is not enough memory", memory_limit()]
-        return _refused(UsSimError("; ".join(filter(None, told))))
+        return _refused(UsSimError("there is not enough memory"))
     except Exception:
         if rclpy.ok():  # a compiler that a signal breaks off fails with its own error
             raise

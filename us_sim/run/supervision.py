@@ -17,7 +17,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from us_sim.errors import BagError, UsSimError, memory_limit, printable
+from us_sim.errors import BagError, UsSimError, printable
 from us_sim.nodes import INTERRUPTED
 from us_sim.nodes.settings import RECORDER, VIEWER
 from us_sim.run.domain import domain, namespace, ros_context
@@ -302,8 +302,7 @@ class Supervisor:
             self.finished = True
         elif status > 0 and status != INTERRUPTED and node not in self._were_ready:
             see = f"; see {self._log_path}" if self._log_path else ""
-            limit = f"; {hint}" if (hint := memory_limit()) else ""
-            raise UsSimError(running.complaint or f"{node} {ending(status)}{see}{limit}")
+            raise UsSimError(running.complaint or f"{node} {ending(status)}{see}")
         else:
             self._on_lost(node, ending(status), running.last_words)
 

@@ -48,7 +48,7 @@ def test_a_phantom_comes_back_as_it_was_made():
 
 
 def test_what_a_killed_process_left_is_cleared_away_and_kept_arrays_are_not_copied(cache):
-    left_over = cache / "small.partial-abc"
+    left_over = cache / "small.partial"
     left_over.mkdir(parents=True)
     kept_volume("small", _small)
     assert not left_over.exists()

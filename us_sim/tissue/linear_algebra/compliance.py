@@ -204,12 +204,7 @@ def surface_compliance(
         )
     if not _KEPT <= 9 * touched * free <= _MOST_KEPT:
         return _compute(model, progress, has_error)
-
-    def waiting() -> None:
-        if progress is not None:
-            progress(0.0, "waiting for another process that computes it")
-
-    return kept(_key(model), _FORM, lambda: _compute(model, progress), waiting)
+    return kept(_key(model), _FORM, lambda: _compute(model, progress))
 
 
 def loaded_displacement(model: TissueModel) -> NDArray[np.float64]:

@@ -129,13 +129,8 @@ def cached_phantom(
         VolumeError: there is no such phantom, or the seed or voxel size is out of its range.
     """
     make: Callable[[int, float, Progress | None], Volume] = PHANTOMS.load(name)
-
-    def waiting() -> None:
-        if progress is not None:
-            progress(0.0, "waiting for another process that makes it")
-
     key = _key(name, seed, voxel_size)
-    return kept_volume(key, lambda: make(seed, voxel_size, progress), waiting)
+    return kept_volume(key, lambda: make(seed, voxel_size, progress))
 
 
 def is_phantom_kept(name: str, seed: int, voxel_size: float) -> bool:
@@ -143,17 +138,14 @@ def is_phantom_kept(name: str, seed: int, voxel_size: float) -> bool:
     return (cache_folder() / _key(name, seed, voxel_size)).is_dir()
 
 
-def kept_volume(
-    key: str, make: Callable[[], Volume], waiting: Callable[[], None] | None = None
-) -> Volume:
+def kept_volume(key: str, make: Callable[[], Volume]) -> Volume:
     """The labelled volume cached under a key, made first if it is not there.
 
     Args:
         key: a file name that contains everything on which the volume's bytes depend.
         make: makes the volume; called by one process at a time.
-        waiting: called every half second while another process makes it.
     """
-    return kept(key, Form("volume.json", _pack, _unpack), make, waiting)
+    return kept(key, Form("volume.json", _pack, _unpack), make)
 
 
 def _key(name: str, seed: int, voxel_size: float) -> str:
