@@ -16,7 +16,7 @@ import us_sim.nodes.settings
 import us_sim.volume.cases.settings  # noqa: F401 - their settings are some of all
 from us_sim.errors import UsSimError
 from us_sim.geometry.collider import Convex
-from us_sim.scene.scene import ProbeSettings
+from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings import quantity as quantities
 from us_sim.settings import registry
 from us_sim.settings.choice import Choice

@@ -187,9 +187,6 @@ class Choice:
     def __iter__(self) -> Iterator[str]:
         return iter(self.names)
 
-    def __repr__(self) -> str:
-        return f"Choice({self.what!r}: {', '.join(self.names)})"
-
 
 @dataclass(frozen=True)
 class Chosen:

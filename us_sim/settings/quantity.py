@@ -17,8 +17,7 @@ import math
 import re
 from dataclasses import dataclass
 
-from us_sim.errors import SettingsError
-from us_sim.settings.spelling import shown, unknown
+from us_sim.settings.spelling import shown
 
 _UNITS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
@@ -67,10 +66,6 @@ class Quantity:
     dimension: str
     minimum: float = -math.inf
     maximum: float = math.inf
-
-    def __post_init__(self) -> None:
-        if self.dimension not in _UNITS:
-            raise SettingsError(f"dimension {unknown(self.dimension, _UNITS)}")
 
     @property
     def unit(self) -> str:

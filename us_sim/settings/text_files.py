@@ -49,8 +49,8 @@ def load_yaml(text: str) -> Any:
         raise YamlError(f"is not YAML: {error}") from error
 
 
-def read_yaml(path: Path, error_type: type[UsSimError], label: Path | None = None) -> Any:
-    """The content of a YAML file, in Python's own types; errors name it, or the label.
+def read_yaml(path: Path, error_type: type[UsSimError]) -> Any:
+    """The content of a YAML file, in Python's own types; errors name it.
 
     Raises:
         UsSimError: of that type, it cannot be read, or as `load_yaml`.
@@ -58,9 +58,9 @@ def read_yaml(path: Path, error_type: type[UsSimError], label: Path | None = Non
     try:
         return load_yaml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise error_type(f"{label or path}: cannot be read: {error}") from error
+        raise error_type(f"{path}: cannot be read: {error}") from error
     except YamlError as error:
-        raise error_type(f"{label or path}: {error}") from error
+        raise error_type(f"{path}: {error}") from error
 
 
 class _RepeatedKey(yaml.constructor.ConstructorError):

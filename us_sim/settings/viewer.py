@@ -1,9 +1,4 @@
-"""Settings of the viewer, which the command line reads without ROS.
-
->>> from us_sim.settings.viewer import ViewerSettings
->>> ViewerSettings().host
-'127.0.0.1'
-"""
+"""Settings of the viewer, which the command line reads without ROS."""
 
 from __future__ import annotations
 
