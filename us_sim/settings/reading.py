@@ -130,6 +130,9 @@ class Reader:
         """The option named under the choice's key, with the other keys as its settings."""
         mapping = self._mapping(document, path)
         if choice.key not in mapping:
+            for key in mapping:
+                if nearest(key, [choice.key]):
+                    raise self._unknown_key(key, {choice.key}, path)
             raise self._refused(
                 joined(path, choice.key), f"is missing; it is one of {', '.join(choice.names)}"
             )
