@@ -12,7 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import yaml
 
-from us_sim.command.options import add_setting_options, read_settings, scene_name
+from us_sim.command.options import (
+    add_scene_options,
+    add_setting_options,
+    read_settings,
+    scene_name,
+)
 from us_sim.errors import BagError, SceneError, StiffnessError
 from us_sim.settings.spelling import aligned
 from us_sim.share import full_path
@@ -25,19 +30,11 @@ if TYPE_CHECKING:
 
 
 def fit_stiffness_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "scene", nargs="?", help="scene file, name of an installed one, or folder of a case"
-    )
+    add_scene_options(parser)
     parser.add_argument("session", type=Path, help="recording with the probe's poses and wrenches")
     add_setting_options(parser, StiffnessSettings)
     parser.add_argument(
-        "--case", metavar="NAME", help="case to make the scene from: its name or folder"
-    )
-    parser.add_argument(
         "--into-case", action="store_true", help="write the moduli into the case, too"
-    )
-    parser.add_argument(
-        "--volume", type=Path, metavar="FILE", help="volume in place of the scene's"
     )
     parser.set_defaults(command=_fit)
 
@@ -47,11 +44,8 @@ def _fit(args: argparse.Namespace) -> int:
     from us_sim.scene.building import materials_of, tissue_model_of, volume_of
     from us_sim.scene.reading import load_scene
     from us_sim.tissue.stiffness_fit import fit_stiffness
-    from us_sim.volume.cases.case import is_case
 
     settings = read_settings(args, StiffnessSettings)
-    if args.scene is not None and is_case(args.scene):
-        args.scene, args.case = None, args.scene
     name = scene_name(args)
     scene = load_scene(name, volume=args.volume)
     if args.into_case and not scene.volume.case:

@@ -131,7 +131,7 @@ _OF_THE_VIEWER = ("host", "port", "recordings")
 
 
 def add_scene_options(parser: argparse.ArgumentParser, default: str = "") -> None:
-    """A scene, or a case in place of it, another volume, and parameters of the scene's nodes."""
+    """A scene, or a case in place of it, and another volume."""
     parser.add_argument(
         "scene", nargs="?", help=f"scene file, or name of an installed one{default}"
     )
@@ -141,6 +141,10 @@ def add_scene_options(parser: argparse.ArgumentParser, default: str = "") -> Non
     parser.add_argument(
         "--volume", type=Path, metavar="FILE", help="volume in place of the scene's"
     )
+
+
+def add_parameter_option(parser: argparse.ArgumentParser) -> None:
+    """Parameters of the scene's nodes."""
     parser.add_argument(
         "--param",
         action="append",
@@ -197,6 +201,7 @@ def add_running_options(parser: argparse.ArgumentParser, default: str = "") -> N
     from us_sim.run.supervision import SupervisionSettings
 
     add_scene_options(parser, default)
+    add_parameter_option(parser)
     add_setting_options(parser, SupervisionSettings)
     add_network_option(parser)
 

@@ -10,7 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from us_sim.command.options import add_setting_options, read_settings, scene_name
+from us_sim.command.options import (
+    add_scene_options,
+    add_setting_options,
+    read_settings,
+    scene_name,
+)
 from us_sim.errors import SceneError, SolverError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
@@ -55,11 +60,8 @@ class PressSettings(Settings):
 
 
 def press_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "scene", nargs="?", help="scene file, name of an installed one, or folder of a case"
-    )
+    add_scene_options(parser)
     parser.add_argument("--solver", help="method in place of the scene's")
-    parser.add_argument("--case", metavar="NAME", help="case to make the scene from")
     add_setting_options(parser, PressSettings)
     parser.set_defaults(command=_press)
 
@@ -73,7 +75,7 @@ def _press(args: argparse.Namespace) -> int:
     from us_sim.tissue.solvers.solver import create_solver
 
     settings = read_settings(args, PressSettings)
-    scene = load_scene(scene_name(args))
+    scene = load_scene(scene_name(args), volume=args.volume)
     section = scene.tissue
     if section is None:
         raise SceneError(f"{scene.origin}: tissue: is missing, so that there is nothing to press")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from us_sim.command.options import (
     add_network_option,
+    add_parameter_option,
     add_path_option,
     add_running_options,
     add_scene_options,
@@ -121,6 +122,7 @@ def render_options(render: argparse.ArgumentParser) -> None:
         help="beside each image what is known of it: labels (PNG) and displacement (NumPy's .npy)",
     )
     add_scene_options(render)
+    add_parameter_option(render)
     render.set_defaults(command=_render)
 
 

@@ -178,7 +178,7 @@ def tissue_model_of(
             is unknown.
         MeshError, MaterialError: the mesh or a material cannot be used.
     """
-    from us_sim.tissue.model import TissueModel
+    from us_sim.tissue.model import TissueModel, face_nodes, facing_nodes
 
     section = scene.tissue
     if section is None:
@@ -190,13 +190,11 @@ def tissue_model_of(
     if note is not None:
         for remark in (*remarks, *held):
             note(f"tissue mesh: {remark}")
-    from us_sim.tissue.model import face_nodes, facing_nodes
-
     touched = facing_nodes(mesh) if section.mesh.file else face_nodes(mesh, "top", 0.0)
     contact = np.setdiff1d(touched, np.flatnonzero(fixed)).astype(np.int32)
     return TissueModel(
         mesh=mesh,
-        materials=_materials(scene, section.materials, mesh, volume, fractions),
+        materials=materials_of(scene, section.materials, mesh, volume, fractions),
         fixed=fixed,
         collider=collider_of(scene),
         contact_nodes=contact,
@@ -219,8 +217,14 @@ def materials_of(
     Raises:
         SceneError: a label of the volume has no material, or a material no label.
     """
+    from us_sim.tissue.elasticity.materials import average_over_labels, uniform_material
+
     fractions = fractions or label_fractions_of(mesh, volume)
-    return _materials(scene, materials, mesh, volume, fractions)
+    require_materials(scene, materials, volume.label_names if fractions else None)
+    if fractions is None:
+        return uniform_material(mesh, materials["tissue"])
+    by_label = {label: materials[name] for label, name in volume.label_names.items()}
+    return average_over_labels(fractions, by_label)
 
 
 def label_fractions_of(mesh: TetrahedralMesh, volume: Volume) -> LabelFractions | None:
@@ -230,22 +234,6 @@ def label_fractions_of(mesh: TetrahedralMesh, volume: Volume) -> LabelFractions 
     if volume.labels is None:
         return None
     return label_fractions(mesh, volume.labels, volume.patient_to_index)
-
-
-def _materials(
-    scene: Scene,
-    materials: Mapping[str, Material],
-    mesh: TetrahedralMesh,
-    volume: Volume,
-    fractions: LabelFractions | None,
-) -> TissueMaterials:
-    from us_sim.tissue.elasticity.materials import average_over_labels, uniform_material
-
-    require_materials(scene, materials, volume.label_names if fractions else None)
-    if fractions is None:
-        return uniform_material(mesh, materials["tissue"])
-    by_label = {label: materials[name] for label, name in volume.label_names.items()}
-    return average_over_labels(fractions, by_label)
 
 
 def require_materials(

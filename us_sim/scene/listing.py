@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from us_sim.errors import UsSimError
-from us_sim.scene.reading import find_scene, load_scene
+from us_sim.scene.reading import find_scene, installed_scenes, load_scene
 from us_sim.scene.scene import CASE_PREFIX
-from us_sim.share import shared_roots
 
 
 @dataclass(frozen=True)
@@ -32,11 +31,7 @@ def listed_scenes() -> Iterator[ListedScene]:
     """Installed scenes, then the cases of `case_roots`; each name once."""
     from us_sim.volume.cases.case import case_roots, cases_in
 
-    files: dict[str, Path] = {}
-    for root in shared_roots():
-        for file in sorted((root / "config" / "scenes").glob("*.yaml")):
-            files.setdefault(file.stem, file)
-    for file in files.values():
+    for file in installed_scenes().values():
         yield listed_scene(str(file))
     folders: dict[str, Path] = {}
     for root in case_roots():

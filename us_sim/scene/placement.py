@@ -160,12 +160,10 @@ def check_path_in_volume(
     shown = part_inside(probe, poses, volume.patient_to_index, volume.shape, scanned)
     if shown.max() >= _LITTLE:
         return
-    inside = part_inside(probe, poses, volume.patient_to_index, volume.shape)
     reaches = " × ".join(f"{1e3 * a:.0f} to {1e3 * b:.0f}" for a, b in volume.extent.T)
     middle = 1e3 * np.mean([pose.apply(_middle(probe))[0] for pose in poses], axis=0)
-    what = "is black in" if inside.max() >= _LITTLE else "lies beside"
     raise SceneError(
-        f"{scene.origin}: volume.pose: the volume, {scene.volume.name}, {what} all images along "
+        f"{scene.origin}: volume.pose: the volume, {scene.volume.name}, is seen in no image along "
         f"{file.name}: in `patient` it reaches from {reaches} mm, and the middle of the images is "
         f"at {', '.join(f'{c:.0f}' for c in middle)} mm; the pose may have been made for another "
         f"file: give the pose of this one, or a path that leads there"

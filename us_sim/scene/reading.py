@@ -14,9 +14,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
@@ -34,16 +34,13 @@ from us_sim.scene.scene import CASE_PREFIX, Scene, TissueSettings
 from us_sim.settings.choice import Choice
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, kinds_of, rules_of
-from us_sim.settings.spelling import nearest, shown
-from us_sim.settings.text_files import LARGEST_YAML, read_yaml
+from us_sim.settings.spelling import nearest
+from us_sim.settings.text_files import read_yaml
 from us_sim.share import full_path, shared_roots
 from us_sim.volume.settings import VOXEL_SIZE
 
 BASE = "based_on"
 """The key that names another scene; what a scene says goes before what its base says."""
-
-_LONGEST_CHAIN = 20
-"""Scenes, each based on the next."""
 
 
 def read_document(
@@ -56,9 +53,9 @@ def read_document(
         seen: files that are based on this one.
 
     Raises:
-        SceneError: it cannot be read, is not YAML, is based on itself, or on too many.
+        SceneError: it cannot be read, is not YAML, or is based on itself.
     """
-    document: Any = _yaml(path)
+    document: Any = read_yaml(path, SceneError)
     folders = [path.parent]
     if not isinstance(document, dict) or BASE not in document:
         return document, folders
@@ -72,11 +69,6 @@ def read_document(
         raise SceneError(f"{path}: {BASE}: {error}") from error
     if base in (*seen, path):
         raise SceneError(f"{path}: {BASE}: {base} is based on this scene itself")
-    if len(seen) == _LONGEST_CHAIN:
-        raise SceneError(
-            f"{path}: {BASE}: {seen[0]} is based on more than {_LONGEST_CHAIN} scenes, one on the "
-            f"other: write some of them as one"
-        )
     below: Any
     below, more = read_document(base, find, (*seen, path))
     if not isinstance(below, dict):
@@ -161,13 +153,6 @@ def _settings_in(kind: Any) -> type[Settings] | None:
 
 def _kind_of_each(kind: Any) -> Any:
     return get_args(kind)[1] if get_origin(kind) in (dict, Mapping) else None
-
-
-def _yaml(path: Path) -> Any:
-    with contextlib.suppress(OSError):
-        if (size := path.stat().st_size) > 4 * LARGEST_YAML:  # bytes of a character at most
-            raise SceneError(f"{path}: has {size} bytes, which is no scene: name one that is")
-    return read_yaml(path, SceneError)
 
 
 def check_files(scene: Scene) -> list[str]:
@@ -256,6 +241,15 @@ def _mesh_remarks(tissue: TissueSettings) -> list[str]:
     return [f"{len(mesh.nodes)} nodes", *remarks, *(said for said in held if said)]
 
 
+def installed_scenes() -> dict[str, Path]:
+    """The files in ``config/scenes``, by name."""
+    known: dict[str, Path] = {}
+    for root in shared_roots():
+        for file in sorted((root / "config" / "scenes").glob("*.yaml")):
+            known.setdefault(file.stem, file)
+    return known
+
+
 def find_scene(name: str | Path) -> Path:
     """The scene file of that path, or of that name in ``config/scenes``.
 
@@ -265,10 +259,7 @@ def find_scene(name: str | Path) -> Path:
     path = Path(os.path.expanduser(name))
     if os.path.isfile(path):
         return path.resolve()
-    known: dict[str, Path] = {}
-    for root in shared_roots():
-        for file in sorted((root / "config" / "scenes").glob("*.yaml")):
-            known.setdefault(file.stem, file)
+    known = installed_scenes()
     stem = path.name.removesuffix(".yaml")
     if str(path) in (stem, f"{stem}.yaml") and stem in known:
         return known[stem]
@@ -290,9 +281,7 @@ def load_scene(name: str | Path, *, volume: str | Path | None = None) -> Scene:
         SceneError: the file or a value in it cannot be used; one sentence with file and key.
     """
     document, folders, origin = scene_document(name)
-    if volume:
-        if not isinstance(document, dict) or not isinstance(document.get("volume", {}), dict):
-            raise SceneError(f"{origin}: volume: must be a mapping of keys")
+    if volume and isinstance(document, dict):
         document = with_volume(document, str(full_path(volume)))
     return parse_scene(document, origin=origin, folders=folders)
 
@@ -340,9 +329,9 @@ def parse_scene(document: object, *, origin: str = "scene", folders: Sequence[Pa
         return _existing(name, origin, [*folders, Path.cwd()], key)
 
     document = _with_case(document, origin, [*folders, Path.cwd()])
-    document = _with_named_structures(document, origin)
+    document = _with_named_structures(document)
     Reader(origin, None, SceneError).read(Scene, document)  # files matter once all else is right
-    scene = Reader(origin, find_file, SceneError).read(Scene, document).named(origin)
+    scene = replace(Reader(origin, find_file, SceneError).read(Scene, document), origin=origin)
     probe = probe_of(scene)
     if scene.imaging.acoustics.is_live:
         try:
@@ -354,13 +343,9 @@ def parse_scene(document: object, *, origin: str = "scene", folders: Sequence[Pa
 
 def _with_case(document: object, origin: str, folders: Sequence[Path]) -> object:
     """A document that names a case has all that the case says and it does not say itself."""
-    if not isinstance(document, dict) or document.get("case") is None:
+    case = document.get("case") if isinstance(document, dict) else None
+    if not isinstance(document, dict) or not isinstance(case, str) or not case.strip():
         return document
-    case = document["case"]
-    if not isinstance(case, str):
-        raise SceneError(f"{origin}: case: must be a text, not {shown(case)}: name a case")
-    if not case.strip():
-        raise SceneError(f"{origin}: case: is empty: give a text, or leave it out")
     from us_sim.scene.case_tissue import case_document
 
     try:
@@ -369,17 +354,12 @@ def _with_case(document: object, origin: str, folders: Sequence[Path]) -> object
         raise SceneError(f"{origin}: case: {error}") from error
 
 
-def _with_named_structures(document: object, origin: str) -> object:
+def _with_named_structures(document: object) -> object:
     """Structures that have nothing but a name may be a list of names, or keys without a value."""
     if not isinstance(document, dict) or "structures" not in document:
         return document
     given = document["structures"]
-    if isinstance(given, list):
-        for i, name in enumerate(given):
-            if not isinstance(name, str):
-                raise SceneError(f"{origin}: structures[{i}]: must be a text, not {shown(name)}")
-            if name in given[:i]:
-                raise SceneError(f"{origin}: structures[{i}]: {name} is there already: keep one")
+    if isinstance(given, list) and all(isinstance(name, str) for name in given):
         given = dict.fromkeys(given)
     if isinstance(given, dict):
         given = {name: {} if value is None else value for name, value in given.items()}

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from types import MappingProxyType
@@ -33,18 +32,6 @@ from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.mesh.tetrahedral_mesh import MeshSettings
 from us_sim.tracking.settings import GateSettings
 from us_sim.volume.settings import VolumeSettings
-
-__all__ = [
-    "CASE_PREFIX",
-    "ImagingSettings",
-    "Part",
-    "ProbeSettings",
-    "Scene",
-    "StructureSettings",
-    "TissueSettings",
-    "TrackerSettings",
-]
-
 
 CASE_PREFIX = "case:"
 """Before the name or the folder of a case, in place of a scene's name."""
@@ -315,10 +302,6 @@ class Scene(Settings):
     def solver_settings(self, name: str) -> Any:
         """The scene's settings of a solver, or None."""
         return self.tissue.settings.get(name) if self.tissue else None
-
-    def named(self, origin: str) -> Scene:
-        """The scene, read from the file ``origin``."""
-        return dataclasses.replace(self, origin=origin)
 
 
 def _part(node: str, section: object | None, key: str, consequence: str) -> Part:
