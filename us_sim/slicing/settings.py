@@ -155,12 +155,6 @@ class Strain(Settings):
         "images from one to the one it is compared with; a slow press needs several",
         default=2,
     )
-    borders: str = setting(
-        default="smooth",
-        choices=("smooth", "sharp"),
-        description="of the tissue's own strain between two labels: averaged like all else, or not "
-        "averaged, which is truer near borders, and shows the tetrahedra there",
-    )
     colours: float | None = setting(
         Quantity("number", 1e-4, 1.0),
         "strain at the ends of the colour bar; not given: a round value that follows the images",

@@ -25,8 +25,7 @@ array([-0.05, -0.05, -0.05], dtype=float32)
 
 from __future__ import annotations
 
-import itertools
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,9 +37,6 @@ from us_sim.slicing.cutting.section import adjugate, is_solid
 from us_sim.slicing.drawing.overlay import ColourScale
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import LinearProbe, Probe
-
-if TYPE_CHECKING:
-    from us_sim.volume.volume import Volume
 
 
 def displacement(frame: Frame) -> NDArray[np.float32]:
@@ -65,85 +61,24 @@ def displacement(frame: Frame) -> NDArray[np.float32]:
     return evaluate(across @ (now - rest), located.elements, threads=frame.threads)
 
 
-_PARTS = 5  # of an edge: the points that are looked up lie evenly, 56 in each tetrahedron
-
-
-def main_labels(
-    nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer], volume: Volume
-) -> NDArray[np.uint8]:
-    """(M,) the label with most of some evenly spaced points; 0 without labels.
-
-    Args:
-        nodes: (N, 3) m, at rest. tetrahedra: (M, 4).
-    """
-    if volume.labels is None:
-        return np.zeros(len(tetrahedra), dtype=np.uint8)
-    to_index = volume.patient_to_index
-    index = nodes @ to_index[:3, :3].T + to_index[:3, 3]
-    last = np.array(volume.shape) - 1
-    corners = index[tetrahedra]
-    counts = itertools.product(range(_PARTS + 1), repeat=3)
-    inner = [(*each, _PARTS - sum(each)) for each in counts if sum(each) <= _PARTS]
-    weights = [(np.array(each) + 0.25) / (_PARTS + 1.0) for each in inner]  # none on a face
-    most = np.zeros(len(tetrahedra), dtype=np.int16)
-    found = np.zeros(len(tetrahedra), dtype=np.uint8)
-    seen = np.stack(
-        [
-            volume.labels[tuple(np.clip(np.rint(place), 0, last).astype(np.intp).T)]
-            for place in (np.einsum("k,ekj->ej", weight, corners) for weight in weights)
-        ],
-        axis=1,
-    )
-    for label in np.unique(seen):
-        count = (seen == label).sum(axis=1, dtype=np.int16)
-        more = count > most
-        most[more], found[more] = count[more], label
-    return found
-
-
-class Corners(NamedTuple):
-    """The P corners that tetrahedra of one tissue share: a node between two tissues is two."""
-
-    numbers: NDArray[np.int32]  # (M, 4) of the tetrahedra's corners
-    starts: NDArray[np.int64]  # (P + 1,) of the list of tetrahedra around each, one after the other
-    members: NDArray[np.int32]  # (starts[-1],)
-
-
-def corners_by_tissue(tetrahedra: NDArray[np.int32], tissue: NDArray[np.integer]) -> Corners:
-    """Corners over which strain is averaged, and not from one tissue to another.
-
-    Args:
-        tetrahedra: (M, 4). tissue: (M,) which one each is of, at least 0.
-    """
-    width = int(tissue.max(initial=0)) + 1
-    keys = tetrahedra.astype(np.int64) * width + np.asarray(tissue, dtype=np.int64)[:, None]
-    _, numbers = np.unique(keys.ravel(), return_inverse=True)
-    numbers = numbers.ravel()  # NumPy 2.0 gives it the shape of the keys
-    count = int(numbers.max(initial=-1)) + 1
-    starts = np.zeros(count + 1, dtype=np.int64)
-    np.cumsum(np.bincount(numbers, minlength=count), out=starts[1:])
-    members = (np.argsort(numbers, kind="stable") // 4).astype(np.int32)
-    return Corners(numbers.reshape(-1, 4).astype(np.int32), starts, members)
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def nodal_deformation(
-    shown, tetrahedra, corners, starts, members, before, now, to_pixel, pixel_volume, steps, place,
-    deformed, done, mean,
+    shown, tetrahedra, starts, members, before, now, to_pixel, pixel_volume, steps, place, deformed,
+    done, mean,
 ):  # fmt: skip
-    """Fills ``mean`` (P, 3) at the corners of the tetrahedra that are shown.
+    """Fills ``mean`` (N, 3) at the nodes of the tetrahedra that are shown.
 
-    It is c in the image's plane: lateral by lateral, lateral by axial, axial by axial. A corner
+    It is c in the image's plane: lateral by lateral, lateral by axial, axial by axial. A node
     around which all tetrahedra are inverted or flat is left without deformation: 1, 0, 1.
 
     Args:
         shown: (E,) numbers of tetrahedra. tetrahedra: (M, 4) nodes.
-        corners, starts, members: as `Corners`.
+        starts, members: (N + 1,) and (4 M,), the tetrahedra around each node.
         before, now: (N, 3) m, nodes in the other state and now.
         to_pixel: (3, 4) from m to column, row and height. pixel_volume: m³ per unit of those.
         steps: (2,) m, from one column to the next, and from one row to the next.
         place: (N, 3) column, row and height of the nodes now, filled here.
-        deformed: (M, 4) room for volume and c of tetrahedra. done: (M + P,) bool, room.
+        deformed: (M, 4) room for volume and c of tetrahedra. done: (M + N,) bool, room.
     """
     for n in range(len(now)):
         for a in range(3):
@@ -158,7 +93,7 @@ def nodal_deformation(
     count = len(tetrahedra)
     for s in shown:
         for k in range(4):
-            n = corners[s, k]
+            n = tetrahedra[s, k]
             if done[count + n]:
                 continue
             done[count + n] = True
@@ -220,26 +155,24 @@ def _deform(tetrahedra, e, before, place, pixel_volume, steps, deformed):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def to_pixels(shown, tetrahedra, corners, place, mean, maps):
-    """Fills ``maps`` (E, 3, 3): coefficients of (1, column, row) of the corners' values.
+def to_pixels(shown, tetrahedra, place, mean, maps):
+    """Fills ``maps`` (E, 3, 3): coefficients of (1, column, row) of the nodes' values.
 
     Args:
-        shown: (E,) numbers of tetrahedra. tetrahedra: (M, 4) nodes. corners: (M, 4).
+        shown: (E,) numbers of tetrahedra. tetrahedra: (M, 4) nodes.
         place: (N, 3) column, row and height of the nodes.
-        mean: (P, 3), as `nodal_deformation` fills it.
+        mean: (N, 3), as `nodal_deformation` fills it.
     """
     for s in range(len(shown)):
         e = shown[s]
-        n0 = tetrahedra[e, 0]
-        size, to_1, to_2, to_3 = adjugate(
-            place, n0, tetrahedra[e, 1], tetrahedra[e, 2], tetrahedra[e, 3]
-        )
+        n0, n1, n2, n3 = tetrahedra[e, 0], tetrahedra[e, 1], tetrahedra[e, 2], tetrahedra[e, 3]
+        size, to_1, to_2, to_3 = adjugate(place, n0, n1, n2, n3)
         r = 1.0 / size
         for k in range(3):
-            at = mean[corners[e, 0], k]
-            b = r * (mean[corners[e, 1], k] - at)
-            c = r * (mean[corners[e, 2], k] - at)
-            d = r * (mean[corners[e, 3], k] - at)
+            at = mean[n0, k]
+            b = r * (mean[n1, k] - at)
+            c = r * (mean[n2, k] - at)
+            d = r * (mean[n3, k] - at)
             maps[s, k, 0] = at + b * to_1[0] + c * to_2[0] + d * to_3[0]
             maps[s, k, 1] = b * to_1[1] + c * to_2[1] + d * to_3[1]
             maps[s, k, 2] = b * to_1[2] + c * to_2[2] + d * to_3[2]
@@ -250,46 +183,32 @@ class AxialStrain:
 
     Args:
         rest_nodes: (N, 3) m. tetrahedra: (M, 4) indices into them.
-        tissue: (M,) which tissue each is of, at least 0: strain is averaged at the nodes of one
-            tissue only. None is one for all.
     """
 
-    def __init__(
-        self,
-        rest_nodes: ArrayLike,
-        tetrahedra: ArrayLike,
-        tissue: NDArray[np.integer] | None = None,
-    ) -> None:
+    def __init__(self, rest_nodes: ArrayLike, tetrahedra: ArrayLike) -> None:
         self._rest = np.array(rest_nodes, dtype=np.float64)
         self._tetrahedra = np.array(tetrahedra, dtype=np.int32)
         nodes, count = self._rest.shape, len(self._tetrahedra)
-        self._corners = corners_by_tissue(
-            self._tetrahedra, np.zeros(count, dtype=np.int64) if tissue is None else tissue
-        )
-        corners = len(self._corners.starts) - 1
+        corners = self._tetrahedra.ravel()
+        self._starts = np.zeros(nodes[0] + 1, dtype=np.int64)
+        np.cumsum(np.bincount(corners, minlength=nodes[0]), out=self._starts[1:])
+        self._members = (np.argsort(corners, kind="stable") // 4).astype(np.int32)
         self._now, self._before, self._place = np.empty(nodes), np.empty(nodes), np.empty(nodes)
-        self._mean = np.empty((corners, 3))
+        self._mean = np.empty(nodes)
         self._deformed = np.empty((count, 4))
-        self._done = np.empty(count + corners, dtype=np.bool_)
+        self._done = np.empty(count + nodes[0], dtype=np.bool_)
         self._directions: tuple[Probe, NDArray[np.float32]] | None = None
 
     @classmethod
-    def of(cls, frame: Frame, *, sharp: bool = False) -> AxialStrain:
+    def of(cls, frame: Frame) -> AxialStrain:
         """The strain of the mesh that carries the volume in a frame.
-
-        Args:
-            sharp: average nothing over borders of the volume's labels, as far as the mesh follows
-                them.
 
         Raises:
             MeshError: there is none.
         """
         if frame.mesh is None:
             raise MeshError("no tissue carries the volume, so there is no strain")
-        nodes, tetrahedra = frame.mesh
-        return cls(
-            nodes, tetrahedra, main_labels(nodes, tetrahedra, frame.volume) if sharp else None
-        )
+        return cls(*frame.mesh)
 
     def image(self, frame: Frame, before: NDArray[np.float64] | None = None) -> NDArray[np.float32]:
         """(rows, columns): the strain along each pixel's beam, negative where tissue got shorter.
@@ -310,13 +229,12 @@ class AxialStrain:
         then = self._rest if before is None else self._as_kernels_take(before, self._before)
         shown = located.tetrahedra
         nodal_deformation(
-            shown, self._tetrahedra, *self._corners, then, now, plane.to_pixel,
+            shown, self._tetrahedra, self._starts, self._members, then, now, plane.to_pixel,
             float(np.linalg.det(plane.basis)), frame.probe.pixel_spacing, self._place,
             self._deformed, self._done, self._mean,
         )  # fmt: skip
         maps = np.empty((len(shown), 3, 3))
-        numbers = self._corners.numbers
-        to_pixels(shown, self._tetrahedra, numbers, self._place, self._mean, maps)
+        to_pixels(shown, self._tetrahedra, self._place, self._mean, maps)
         values = np.empty(located.elements.shape, dtype=np.float32)
         elements, directions = located.elements, self._directions_of(frame.probe)
         parallel_rows(

@@ -93,18 +93,8 @@ def track(
         (samples, lines): displacement, positive away from the face; and the correlation of what
         was found, -1 to 1; 0 where there is nothing to be found by, or the beams of the earlier
         image may have begun or ended within it.
-
-    Raises:
-        ProbeError: the images differ in size, or a window is longer than half a beam.
     """
     first, second = (np.array(image, dtype=np.float32) for image in (earlier, later))
-    if first.shape != second.shape or first.ndim != 2:
-        raise ProbeError(f"images of {first.shape} and {second.shape} cannot be compared")
-    if 2 * window[0] > first.shape[0]:
-        raise ProbeError(
-            f"a window of {window[0]} samples is longer than half a beam of {first.shape[0]}: make "
-            f"strain.window shorter"
-        )
     size = window[::-1]
     later_window = second, *_moments(second, size)
     found, correlation = _search(first, later_window, size, search)

@@ -78,17 +78,16 @@ def _strain_stream(
 def _tissue_strain(node: SceneNode, live: LiveSettings) -> FrameStream:
     """Return ``ultrasound/strain``: of the tissue itself, since rest or since an image before."""
     earlier = Earlier(lambda frame: frame.nodes)
-    made: dict[str, tuple[object, AxialStrain]] = {}  # the last mesh, and its strain, by borders
+    made: tuple[object, AxialStrain] | None = None  # the last mesh, and its strain
 
     def make(frame: Frame, settings: Strain) -> Values | None:
+        nonlocal made
         before = earlier.before(frame, settings.interval)
         if settings.since == "image" and before is None:
             return None
-        if settings.borders not in made or made[settings.borders][0] is not frame.mesh:
-            strain = AxialStrain.of(frame, sharp=settings.borders == "sharp")
-            made[settings.borders] = frame.mesh, strain
-        strain = made[settings.borders][1]
-        return strain.image(frame, before if settings.since == "image" else None)
+        if made is None or made[0] is not frame.mesh:
+            made = frame.mesh, AxialStrain.of(frame)
+        return made[1].image(frame, before if settings.since == "image" else None)
 
     def note(values: Values) -> str:
         pressed = compression(values)

@@ -15,82 +15,31 @@ from us_sim.settings.setting import Settings, setting
 
 AROUND = "tissue"  # the name of what is in no structure
 
+# dB/cm/MHz and Rayl, by words of a label's name.
 # Szabo, Diagnostic Ultrasound Imaging: Inside Out (2nd ed., 2014), Appendix B, table B.1.
-_BLOOD = (0.14, 1.679e6)
-_BONE = (3.54, 6.364e6)
-_FAT = (0.6, 1.327e6)
-_MUSCLE = (0.57, 1.645e6)
-_LIVER = (0.45, 1.657e6)
-_SPLEEN = (0.4, 1.652e6)
-_BRAIN = (0.58, 1.617e6)
-_BREAST = (0.75, 1.54e6)
-_HEART = (0.52, 1.647e6)
-_WATER = (2.17e-3, 1.482e6)
-# Culjat, Goldenberg, Tewari, Singh, Ultrasound Med Biol 36 (2010) 861-873, table 1.
-_CONNECTIVE = (1.57, 1.81e6)
-_TENDON = (4.7, 1.84e6)
-_SOFT_TISSUE = (0.54, 1.63e6)
-_AIR = (7.5, 400.0)  # attenuation: Narayana, Ophir, Maklad, J Ultrasound Med 3 (1984) 461-464
-# Aubry et al., J Acoust Soc Am 152 (2022) 1003-1019: 0.4 dB/cm/MHz, 1610 m/s, 1090 kg/m3.
-_SKIN = (0.4, 1.755e6)
-
-_TABLE: dict[str, tuple[float, float]] = {
-    AROUND: _SOFT_TISSUE,
-    "background": _SOFT_TISSUE,
-    "blood": _BLOOD,
-    "artery": _BLOOD,
-    "arteries": _BLOOD,
-    "aorta": _BLOOD,
-    "vein": _BLOOD,
-    "veins": _BLOOD,
-    "vena": _BLOOD,
-    "cava": _BLOOD,
-    "portal": _BLOOD,
-    "vessel": _BLOOD,
-    "vessels": _BLOOD,
-    "lumen": _BLOOD,
-    "bone": _BONE,
-    "bones": _BONE,
-    "rib": _BONE,
-    "ribs": _BONE,
-    "humerus": _BONE,
-    "femur": _BONE,
-    "radius": _BONE,
-    "ulna": _BONE,
-    "tibia": _BONE,
-    "fibula": _BONE,
-    "clavicle": _BONE,
-    "vertebra": _BONE,
-    "vertebrae": _BONE,
-    "fat": _FAT,
-    "adipose": _FAT,
-    "muscle": _MUSCLE,
-    "muscles": _MUSCLE,
-    "liver": _LIVER,
-    "spleen": _SPLEEN,
-    "brain": _BRAIN,
-    "nerve": _BRAIN,  # nervous tissue
-    "nerves": _BRAIN,
-    "breast": _BREAST,
-    "heart": _HEART,
-    "myocardium": _HEART,
-    "water": _WATER,
-    "fluid": _WATER,
-    "bile": _WATER,
-    "gallbladder": _WATER,
-    "bladder": _WATER,
-    "cyst": _WATER,
-    "urine": _WATER,
-    "skin": _SKIN,
-    "fascia": _CONNECTIVE,
-    "ligament": _CONNECTIVE,
-    "capsule": _CONNECTIVE,
-    "tendon": _TENDON,
-    "tendons": _TENDON,
-    "air": _AIR,
-    "gas": _AIR,
-    "lung": _AIR,
-    "lungs": _AIR,
+_CONSTANTS: tuple[tuple[float, float, str], ...] = (
+    (0.14, 1.679e6, "blood artery arteries aorta vein veins vena cava portal vessel vessels lumen"),
+    (3.54, 6.364e6, "bone bones rib ribs humerus femur radius ulna tibia fibula clavicle"),
+    (3.54, 6.364e6, "vertebra vertebrae"),
+    (0.6, 1.327e6, "fat adipose"),
+    (0.57, 1.645e6, "muscle muscles"),
+    (0.45, 1.657e6, "liver"),
+    (0.4, 1.652e6, "spleen"),
+    (0.58, 1.617e6, "brain nerve nerves"),  # nervous tissue
+    (0.75, 1.54e6, "breast"),
+    (0.52, 1.647e6, "heart myocardium"),
+    (2.17e-3, 1.482e6, "water fluid bile gallbladder bladder cyst urine"),
+    # Culjat, Goldenberg, Tewari, Singh, Ultrasound Med Biol 36 (2010) 861-873, table 1.
+    (1.57, 1.81e6, "fascia ligament capsule"),
+    (4.7, 1.84e6, "tendon tendons"),
+    (0.54, 1.63e6, f"{AROUND} background"),
+    # Attenuation: Narayana, Ophir, Maklad, J Ultrasound Med 3 (1984) 461-464.
+    (7.5, 400.0, "air gas lung lungs"),
+    # Aubry et al., J Acoust Soc Am 152 (2022) 1003-1019: 1610 m/s, 1090 kg/m3.
+    (0.4, 1.755e6, "skin"),
+)
+_TABLE = {
+    word: (loss, impedance) for loss, impedance, words in _CONSTANTS for word in words.split()
 }
 
 

@@ -42,12 +42,7 @@ def parallel_rows(
     Args:
         work: a kernel that does not hold the interpreter's lock.
         band: rows that stay together: every run starts at a multiple of it.
-
-    Raises:
-        ValueError: fewer than one thread.
     """
-    if threads < 1:
-        raise ValueError(f"give at least one thread, not {threads}")
     rows_each = band * -(-rows // (band * threads))
     others = [
         _pool(threads - 1).submit(work, first, min(first + rows_each, rows))

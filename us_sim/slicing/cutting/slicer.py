@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SLICERS
-from us_sim.settings.setting import Settings
 from us_sim.slicing.cutting.resampling import (
     label_voxels,
     parallel_rows,
@@ -36,12 +35,9 @@ class Slicer(ABC):
 
     Raises:
         MeshError: the mesh is not finite, or its tetrahedra name nodes that are not there.
-        ValueError: fewer than one thread.
     """
 
     skipped: int = 0  # inverted or flat tetrahedra on the latest image, which were left out
-
-    Settings: ClassVar[type[Settings]] = Settings  # the class of this method's settings
 
     def __init__(
         self,
@@ -55,8 +51,6 @@ class Slicer(ABC):
 
         The image does not depend on the number of threads.
         """
-        if threads < 1:
-            raise ValueError(f"give at least one thread, not {threads}")
         self._volume, self._threads = volume, threads
         self._mesh = RestMesh(rest_nodes, tetrahedra, volume.patient_to_index)
         self._prepare()
