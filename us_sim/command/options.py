@@ -7,7 +7,7 @@ keyword-only; a field with one is an option, and a flag where it is a truth.
 >>> from us_sim.command.calibration_settings import ClockSettings
 >>> parser = argparse.ArgumentParser()
 >>> add_setting_options(parser, ClockSettings)
->>> args = parser.parse_args(["a.mcap", "b.mcap", "--largest", "2 min", "--images"])
+>>> args = parser.parse_args(["a.mcap", "b.mcap", "--largest", "2 min"])
 >>> read_settings(args, ClockSettings)
 Traceback (most recent call last):
 ...
