@@ -22,8 +22,8 @@ class Supervisor:
 
     def __init__(self, plan, control):
         self.plan, self.why, self.waiting = plan, "", []
-        made = lambda _, settings: control.show(settings) or control  # noqa: E731
-        self.monitor = SimpleNamespace(control=made, node=SimpleNamespace(reports={}))
+        self.control = lambda _, settings: control.show(settings) or control
+        self.monitor = SimpleNamespace(reports={})
         self.plans = [plan]
 
     def change(self, plan, anew=()):
@@ -35,9 +35,6 @@ class Supervisor:
         why, self.why = self.why, ""
         if why:
             raise UsSimError(why)
-
-    def failed(self):
-        return ""
 
 
 class Control:
@@ -90,7 +87,7 @@ def test_a_recording_and_a_replay_come_and_go_beside_the_nodes(running, tmp_path
     simulation.update()
     assert control.told[-1][1]["record"] == str(tmp_path.resolve() / "a.mcap")
     assert control.told[-1][1]["record_state"] == "starting"
-    supervisor.monitor.node.reports["session_recorder"] = {
+    supervisor.monitor.reports["session_recorder"] = {
         "state": "recording",
         "note": "it lies beside another",
         "bytes": "1500",

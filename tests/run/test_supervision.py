@@ -30,6 +30,7 @@ class Node:
         STARTED.append(node)
         self.node, self.pid, self.status = node, len(STARTED), None
         self.complaint, self.last_words, self.is_noted = "", f"{node.node} was here", False
+        self.reports, self.heard_at = -1, 0.0
 
     def note_end(self):
         self.is_noted = True
@@ -41,29 +42,33 @@ STARTED: list[NodeProcess] = []
 class Monitor:
     """A monitor whose nodes report at once, without any process."""
 
-    def __init__(self, _):
+    def __init__(self):
         self.told = []
         self.silent = set()
         self.running = {}
-        self.node = SimpleNamespace(
-            reports={},
-            messages={},
-            recordings={},
-            heard=Counter(),
-            tell_lost=self.told.append,
-            count=lambda *_: 7,
-            follow=lambda _: None,
-            resolve_topic_name=lambda topic: f"/{topic}",
-        )
+        self.reports, self.messages, self.recordings = {}, {}, {}
+        self.heard = Counter()
+        self.tell_lost = self.told.append
 
-    def spin(self, _=0.1):
+    def count(self, *_):
+        return 7
+
+    def follow(self, _):
+        pass
+
+    def resolve_topic_name(self, topic):
+        return f"/{topic}"
+
+    def spin_once(self, **_):
         for node, process in self.running.items():
             if process.status is None and node not in self.silent:
-                self.node.heard[node, process.pid] += 1
-                self.node.reports.setdefault(node, {})["pid"] = str(process.pid)
+                self.heard[node, process.pid] += 1
+                self.reports.setdefault(node, {})["pid"] = str(process.pid)
 
-    def close(self):
-        pass
+
+def listen(supervisor, _):
+    supervisor.monitor = supervisor._executor = Monitor()
+    supervisor.monitor.running = supervisor._running
 
 
 @pytest.fixture(autouse=True)
@@ -78,7 +83,7 @@ def killed(monkeypatch):
 
     STARTED.clear()
     monkeypatch.setattr("us_sim.run.supervision.RunningNode", Node)
-    monkeypatch.setattr("us_sim.run.supervision.Monitored", Monitor)
+    monkeypatch.setattr(Supervisor, "_listen", listen)
     monkeypatch.setattr("us_sim.run.supervision.end_nodes", end)
     return names
 
@@ -87,7 +92,6 @@ def supervised(plan, **settings):
     """Return a supervisor that runs the plan, its processes by node, and its monitor."""
     supervisor = Supervisor(SupervisionSettings(**settings))
     supervisor.start(plan)
-    supervisor.monitor.running = supervisor._running
     return supervisor, supervisor._running, supervisor.monitor
 
 
@@ -125,13 +129,13 @@ def test_images_that_were_not_to_be_recorded_are_not_lost(tmp_path, settings, lo
     recorder = NodeProcess("session_recorder", {"file": file} | settings)
     plan = Plan([recorder, NodeProcess("slice_interpolator")])
     supervisor, _, monitor = supervised(plan)
-    monitor.node.recordings[file] = 1
+    monitor.recordings[file] = 1
     assert bool(supervisor.outcome().sentence()) is lost
 
 
 def test_a_path_that_was_never_played_is_a_loss(session):
     supervisor, _, monitor = session
-    monitor.node.reports["path_player"] = {"awaited": "the end of days"}
+    monitor.reports["path_player"] = {"awaited": "the end of days"}
     assert "the end of days" in supervisor.outcome().sentence()
 
 
@@ -186,10 +190,21 @@ def test_the_rest_goes_on_without_one_that_is_given_up(session):
     assert not supervisor.finished
 
 
+def test_a_node_that_is_given_up_before_all_are_ready_ends_all(session):
+    supervisor, running, monitor = session
+    monitor.silent = {"path_player"}
+    for _ in range(2):
+        running["slice_interpolator"].status = -11
+        supervisor.update()
+    running["slice_interpolator"].status = -11
+    with pytest.raises(UsSimError, match="after 2 restarts"):
+        supervisor.update()
+
+
 def test_without_its_player_the_run_is_over(session):
     supervisor, running, monitor = session
     supervisor.update()
-    monitor.node.reports["path_player"] |= {"begun": "1700000000.5", "played": "120"}
+    monitor.reports["path_player"] |= {"begun": "1700000000.5", "played": "120"}
     for _ in range(3):
         assert not supervisor.finished
         running["path_player"].status = INTERRUPTED
@@ -206,7 +221,7 @@ def test_a_recorder_goes_on_in_a_further_file_and_all_of_its_own_are_told(sessio
     supervisor.update()
     again = STARTED[3].parameters
     assert (again["file"], again["if_exists"]) == (str(tmp_path / "session.mcap"), "further")
-    monitor.node.recordings |= {"session.mcap": 1, "session_1.mcap": 4, "of_a_stranger.mcap": 77}
+    monitor.recordings |= {"session.mcap": 1, "session_1.mcap": 4, "of_a_stranger.mcap": 77}
     outcome = supervisor.outcome()
     assert [file.name for file in outcome.files] == ["session.mcap", "session_1.mcap"]
     assert "0 images were recorded of 7" in outcome.sentence()
@@ -227,7 +242,7 @@ def test_a_recorder_that_had_to_be_killed_is_a_loss(session, killed):
 def test_a_node_of_another_simulation_is_told_once(session, capsys):
     supervisor, _, monitor = session
     supervisor.update()
-    monitor.node.heard["slice_interpolator", 77] += 1
+    monitor.heard["slice_interpolator", 77] += 1
     supervisor.update()
     supervisor.update()
     assert capsys.readouterr().err.count("ROS_DOMAIN_ID") == 1
@@ -253,7 +268,7 @@ def test_another_plan_ends_what_it_lacks_and_then_starts_what_is_new(session):
     assert supervisor.waiting == []
     assert not supervisor.losses
     # How many images were made while something was recorded is not known then.
-    monitor.node.recordings[str(file)] = 1
+    monitor.recordings[str(file)] = 1
     assert supervisor.outcome().sentence() == ""
 
 

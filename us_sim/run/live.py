@@ -95,8 +95,6 @@ def _await_all(update: Callable[[], None], supervisor: Supervisor) -> None:
             is_long = time.monotonic() - began > _LONG_START_S
             why = "a first run compiles for minutes: " if is_long else ""  # what is behind is cut
             bar.update(count - len(waiting), why + ", ".join(waiting[:2]) + more)
-            if failed := supervisor.failed():
-                raise UsSimError(failed)
 
 
 def _stay(update: Callable[[], None], supervisor: Supervisor) -> None:
@@ -107,7 +105,7 @@ def _stay(update: Callable[[], None], supervisor: Supervisor) -> None:
             update()
             now = time.monotonic()
             ended = ended or now if supervisor.finished else None
-            bar.update(now - began, _status(supervisor.plan, supervisor.monitor.node))
+            bar.update(now - began, _status(supervisor.plan, supervisor.monitor))
             if duration is not None and now - began > duration:
                 return
             if ended is not None and now - ended > SETTLE_S:

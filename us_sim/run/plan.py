@@ -188,14 +188,10 @@ def plan_of(request: Request) -> Plan:
     if request.path is None:
         return Plan(processes, duration=request.duration)
     path = path_of(scene, request.path, request.topic or str(player.get("topic") or "") or None)
-    topics, space, records = (
-        ["tracker/pose", *scene.ready_topics],
-        namespace(),
-        recorder_of(processes),
-    )
-    recorded = [
-        each for each in topics if records and records.records(posixpath.join(space, each), space)
-    ]
+    topics, space = ["tracker/pose", *scene.ready_topics], namespace()
+    names = {each: posixpath.join(space, each) for each in topics}
+    settings_of = recorder_of(processes)
+    recorded = [each for each in topics if settings_of and settings_of.records(names[each], space)]
     settings = {"path": played, "topic": path.topic, "await_topics": topics}
     settings |= {"await_recorded": recorded or [""], **request.playing}  # [] has no type
     poses = None if settings.get("stay") else len(path)

@@ -91,6 +91,7 @@ class RunningNode:
         self.complaint = ""  # why it cannot work
         self.last_words = ""
         self.is_noted = False  # that it has ended
+        self.reports, self.heard_at = -1, 0.0  # so far, and when the last came, for who watches it
         output, its_output = _forking.Pipe(duplex=False)
         its_own = (node.node, node.module, node.arguments(), os.environ | node.secrets, its_output)
         context = _forking if is_forked else _spawning

@@ -49,7 +49,7 @@ class Simulation:
         self._bags_at = 0.0
         self._bags: dict[str, str] = {}
         self._problem = ""
-        self._control = supervisor.monitor.control(self, self._shown())
+        self._control = supervisor.control(self, self._shown())
 
     def update(self) -> None:
         """Update as `Supervisor.update`, and continue pending requests.
@@ -59,9 +59,6 @@ class Simulation:
         """
         try:
             self._supervisor.update()
-            failed = self._supervisor.failed()
-            if failed and self._request is not self._settled and self._settled is not None:
-                raise UsSimError(failed)
         except UsSimError as error:
             if self._settled is None or self._request is self._settled:
                 raise
@@ -198,7 +195,7 @@ class Simulation:
         state = f"starting: {ready} of {count} nodes" if waiting else "running"
         if waiting and self._settled is not None and self._settled.scene is not request.scene:
             state += ", no images until all are ready"
-        reports, replay = self._supervisor.monitor.node.reports, self._control.values
+        reports, replay = self._supervisor.monitor.reports, self._control.values
         values: dict[str, str] = {
             "scene": request.scene.name,
             "origin": request.scene.origin,

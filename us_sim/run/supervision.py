@@ -29,6 +29,8 @@ from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import counted
 
 if TYPE_CHECKING:
+    from rclpy.node import Node
+
     from us_sim.nodes.session_control import Controlled, SessionControl
     from us_sim.nodes.session_monitor import SessionMonitor
     from us_sim.nodes.settings import SessionControlSettings
@@ -107,44 +109,6 @@ def images_in(files: Sequence[Path], name: str) -> int:
     return count
 
 
-class Monitored:
-    """A monitor node in this process, with its own context and executor.
-
-    Args:
-        nodes: that are followed.
-    """
-
-    def __init__(self, nodes: list[str]) -> None:
-        from rclpy.executors import SingleThreadedExecutor
-
-        from us_sim.nodes.session_monitor import SessionMonitor
-
-        self._context = ros_context()
-        self.node: SessionMonitor = SessionMonitor(nodes, context=self._context)
-        self._executor: Any = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
-
-    def control(self, controlled: Controlled, settings: SessionControlSettings) -> SessionControl:
-        """Make the node by which a simulation with these settings is controlled."""
-        from us_sim.nodes.session_control import SessionControl
-
-        control = SessionControl(controlled, settings, context=self._context)
-        self._executor.add_node(control)
-        return control
-
-    def spin(self, seconds: float = 0.1) -> None:
-        """Take the next message, waiting at most so long."""
-        self._executor.spin_once(timeout_sec=seconds)
-
-    def close(self) -> None:
-        """Leave the domain."""
-        nodes = self._executor.get_nodes()
-        self._executor.shutdown()
-        for node in nodes:
-            node.destroy_node()
-        self._context.try_shutdown()
-
-
 class Supervisor:
     """Starts the nodes of a plan and keeps them running: one that ends or hangs is started again.
 
@@ -156,7 +120,7 @@ class Supervisor:
         log: where what nodes say goes; None shows it on this terminal, above any progress.
     """
 
-    monitor: Monitored  # hears what they report
+    monitor: SessionMonitor  # hears what they report
 
     def __init__(self, settings: SupervisionSettings, log: Path | None = None) -> None:
         self.plan = Plan([])
@@ -164,11 +128,10 @@ class Supervisor:
         self.finished = False  # whether what is played is at its end, or given up
         self._settings, self._log_path = settings, log
         self._log: IO[str] | None = log.open("w", encoding="utf-8") if log else None
-        self._monitoring = contextlib.ExitStack()  # closes the monitor
+        self._listening = contextlib.ExitStack()  # leaves the domain
         self._running: dict[str, RunningNode] = {}  # the last process of each node
         self._started: set[tuple[str, int]] = set()  # nodes and processes
         self._strangers: set[tuple[str, int]] = set()  # likewise, that others have started
-        self._heard: dict[tuple[str, int], tuple[int, float]] = {}  # reports, time of the last
         self._looked, self._watched = time.monotonic(), 0.0  # s
         self._away: dict[str, Loss] = {}  # that are being started again
         self._were_ready: set[str] = set()
@@ -176,14 +139,40 @@ class Supervisor:
         self._began = time.monotonic()
         self._startup: float | None = None  # s
         self._changes = 0
+        self._is_settled = False  # whether all nodes of the plan have been ready
 
     def start(self, plan: Plan) -> None:
         """Start the nodes of a plan, and hear them; a page loads while ROS is imported here."""
         self._start(each for each in plan.processes if each.node == VIEWER)
-        self.monitor = Monitored(plan.nodes)
-        self._monitoring.callback(self.monitor.close)
-        self._images = self.monitor.node.resolve_topic_name(IMAGES)
+        self._listen(plan.nodes)
+        self._images = self.monitor.resolve_topic_name(IMAGES)
         self.change(plan)
+
+    def _listen(self, nodes: Sequence[str]) -> None:
+        """Make the monitor, in a context and an executor of its own."""
+        from rclpy.executors import SingleThreadedExecutor
+
+        from us_sim.nodes.session_monitor import SessionMonitor
+
+        context = ros_context()
+        self._listening.callback(context.try_shutdown)
+        self._executor: Any = SingleThreadedExecutor(context=context)
+        self._listening.callback(self._executor.shutdown)
+        self.monitor = SessionMonitor(nodes, context=context)
+        self._add(self.monitor)
+
+    def _add(self, node: Node) -> None:
+        self._executor.add_node(node)
+        self._listening.callback(node.destroy_node)
+        self._listening.callback(self._executor.remove_node, node)
+
+    def control(self, controlled: Controlled, settings: SessionControlSettings) -> SessionControl:
+        """Make the node by which a simulation with these settings is controlled."""
+        from us_sim.nodes.session_control import SessionControl
+
+        control = SessionControl(controlled, settings, context=self.monitor.context)
+        self._add(control)
+        return control
 
     def change(self, plan: Plan, anew: Collection[str] = ()) -> None:
         """Run this plan; processes that the plan before had, too, go on.
@@ -206,7 +195,8 @@ class Supervisor:
         self.plan, self.finished = plan, False
         self._restarts.clear()
         self._changes += 1
-        self.monitor.node.follow(plan.nodes)
+        self._is_settled = False
+        self.monitor.follow(plan.nodes)
         self._start(each for each in plan.processes if each.node not in self._running)
 
     def _start(self, processes: Iterable[NodeProcess]) -> None:
@@ -237,26 +227,21 @@ class Supervisor:
     @property
     def waiting(self) -> list[str]:
         """Nodes that have not reported yet, or not yet again."""
-        heard = self.monitor.node.heard
+        heard = self.monitor.heard
         return [node for node, each in self._running.items() if (node, each.pid) not in heard]
-
-    def failed(self) -> str:
-        """Return why the plan cannot run, where a node is given up before all were ready."""
-        late = self.waiting
-        given_up = (loss for loss in self.losses if loss.given_up and loss.node in late)
-        return str(next(given_up, ""))
 
     def update(self) -> None:
         """Take new reports, and restart nodes that have ended or hang.
 
         Raises:
-            UsSimError: a node that was never ready cannot work, in its own words.
+            UsSimError: the plan cannot run: before all were ready a node is given up, or says why
+                it cannot work.
         """
-        self.monitor.spin()
+        self._executor.spin_once(timeout_sec=0.1)
         ended = [each for each in self._running.values() if not each.is_noted]
         ended = [each for each in ended if each.status is not None]
         for _ in range(2 * len(self._running) if ended else 0):
-            self.monitor.spin(0.0)  # what they said last
+            self._executor.spin_once(timeout_sec=0.0)  # what they said last
         for each in ended:
             each.note_end()
             self._on_ended(each)
@@ -272,7 +257,7 @@ class Supervisor:
         for loss in self._away.values():
             loss.given_up = "was not back when the run ended"
         self._away.clear()
-        self._monitoring.close()
+        self._listening.close()
         self._end([*self._running])
         remove_abandoned_segments()
         if self._log is not None:
@@ -281,7 +266,7 @@ class Supervisor:
 
     def outcome(self) -> Outcome:
         """Return how it went, once all has ended."""
-        node, losses = self.monitor.node, [str(loss) for loss in self.losses]
+        node, losses = self.monitor, [str(loss) for loss in self.losses]
         recorded_by = node.recordings.items()
         files = [Path(file) for file, pid in recorded_by if (RECORDER, pid) in self._started]
         # How many images were to be recorded is only known where all that were made were.
@@ -314,15 +299,14 @@ class Supervisor:
         for node, running in [*self._running.items()]:
             if running.is_noted:
                 continue
-            count = self.monitor.node.heard[node, running.pid]
-            before, since = self._heard.get((node, running.pid), (-1, 0.0))
-            silent = self._watched - since
-            if count != before:
-                self._heard[node, running.pid] = count, self._watched
+            count = self.monitor.heard[node, running.pid]
+            silent = self._watched - running.heard_at
+            if count != running.reports:
+                running.reports, running.heard_at = count, self._watched
             elif silent > (self._settings.silence if count else START_S):
                 if node not in self._were_ready:
                     raise UsSimError(f"{node} did not start in {START_S / 60:g} minutes")
-                said = self.monitor.node.messages.get(node) or running.last_words
+                said = self.monitor.messages.get(node) or running.last_words
                 self._end([node])
                 self._on_lost(node, f"has not reported for {silent:.0f} s", said)
 
@@ -331,14 +315,16 @@ class Supervisor:
         limit, given_up = self._settings.restarts, ""
         if self._restarts[node] >= limit:
             given_up = f"is not started again after {counted(limit, 'restart')}"
-        loss = self._note(node, what, said, given_up, "it is started again")
+        loss = self._note(node, what, said, given_up)
         self._publish()
         self._restarts[node] += 1
         if given_up:
             self._away.pop(node, None)
             self.finished |= node == self.plan.player
+            if not self._is_settled:
+                raise UsSimError(str(loss))
             return
-        report = self.monitor.node.reports.get(node, {})
+        report = self.monitor.reports.get(node, {})
         is_own = report.get("pid") == str(self._running[node].pid)
         first = next(each for each in self.plan.processes if each.node == node)
         self._start([going_on(first, report if is_own else {})])
@@ -346,6 +332,7 @@ class Supervisor:
 
     def _note_ready(self) -> None:
         waiting = self.waiting
+        self._is_settled |= not waiting
         if not waiting and self._startup is None:
             self._startup = time.monotonic() - self._began
         self._were_ready |= self._running.keys() - set(waiting)
@@ -357,24 +344,22 @@ class Supervisor:
 
     def _note_strangers(self) -> None:
         """Say once of each node of another simulation that it is here, too."""
-        for each in self.monitor.node.heard.keys() - self._started - self._strangers:
+        for each in self.monitor.heard.keys() - self._started - self._strangers:
             self._strangers.add(each)
             say(
                 f"another {each[0]} is on ROS domain {domain()}: end that simulation, or set "
                 f"ROS_DOMAIN_ID to another number for this one"
             )
 
-    def _note(
-        self, node: str, what: str, said: str = "", given_up: str = "", then: str = ""
-    ) -> Loss:
+    def _note(self, node: str, what: str, said: str = "", given_up: str = "") -> Loss:
         loss = Loss(node, what, round(time.monotonic() - self._began, 2), given_up=given_up)
         self.losses.append(loss)
         last = f", and last said: {said}" if said else ""
-        say(f"{node} {what} after {loss.at_s:.1f} s{last}; {given_up or then}".removesuffix("; "))
+        say(f"{node} {what} after {loss.at_s:.1f} s{last}; {given_up or 'it is started again'}")
         return loss
 
     def _publish(self) -> None:
-        self.monitor.node.tell_lost([str(loss) for loss in self.losses])
+        self.monitor.tell_lost([str(loss) for loss in self.losses])
 
 
 def say(sentence: str) -> None:
