@@ -64,7 +64,7 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
         and (os.cpu_count() or 1) > 1
     ):
         config.stash[_BY_GROUPS] = True
-        option.numprocesses = 2
+        option.numprocesses = 1 + (os.cpu_count() or 1)  # many tests wait for messages
         option.dist = "loadscope"
         option.loadscopereorder = False
 
