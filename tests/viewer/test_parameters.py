@@ -176,7 +176,8 @@ class Pages:
                 task.cancel()
             await asyncio.gather(*others, return_exceptions=True)
 
-        self.call(end)
+        # Not beside a spin: rclpy's executor fails where it waits for what is just destroyed.
+        asyncio.run_coroutine_threadsafe(end(), self.loop).result(30.0)
         self.loop.call_soon_threadsafe(self.loop.stop)
         self._thread.join()
         self.loop.close()
