@@ -16,8 +16,6 @@ import os
 import re
 import signal
 import sys
-import threading
-import time
 from pathlib import Path
 
 from us_sim.errors import UsSimError
@@ -28,24 +26,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 INTERRUPTED = 130  # the exit status of a node that was told to end before its work was done
-ENDS_WITH_INPUT = "US_SIM_ENDS_WITH_INPUT"
-"""Environment variable of programs that end with whoever holds the other end of their input."""
-
-
-ENDING_S = 15.0
-"""For a process to end by itself, a recorder with what it still has to write."""
-
-
-def end_with_input() -> None:
-    """End this process as SIGTERM does, once its standard input has ended, or kill it."""
-    os.read(0, 1)
-    os.kill(os.getpid(), signal.SIGTERM)
-    time.sleep(ENDING_S)
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-if os.environ.pop(ENDS_WITH_INPUT, None):
-    threading.Thread(target=end_with_input, daemon=True).start()
 
 
 def require_rclpy() -> None:
