@@ -206,6 +206,7 @@ def test_a_residual_is_true_that_is_not_below_half_of_the_least(reported, checke
     assert agrees(reported, checked, rounding) is true
 
 
+@pytest.mark.slow
 def test_the_report_has_a_row_for_each_case_and_figures(tmp_path, monkeypatch, capsys):
     many = StabilityCase("many steps", time_step=10.0, stabilisation="substeps")
     cases = [CASE, many, *held_cases(1, seed=3)]

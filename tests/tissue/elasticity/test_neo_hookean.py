@@ -197,6 +197,7 @@ def test_single_precision_serves_every_size_and_stiffness(modulus, length, boxed
     assert np.linalg.norm(got - expected) < 1e-6 * np.linalg.norm(expected)
 
 
+@pytest.mark.slow
 def test_a_contrast_of_1e9_leaves_the_soft_side_its_digits():
     mesh = box_mesh([0.0, 0.01, 0.02, 0.03], [0.0, 0.01], [0.0, 0.01])
     count = len(mesh.tetrahedra)

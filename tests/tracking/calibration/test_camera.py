@@ -139,6 +139,7 @@ def drawn(board):
     return cv2.copyMakeBorder(image, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
 
 
+@pytest.mark.slow
 def test_half_a_board_is_enough_and_a_row_or_none_of_it_is_not():
     board = RigidBody.charuco("4X4_50", 6, 5, 0.03, 0.02)
     photo = drawn(board)

@@ -67,6 +67,7 @@ def truth(made):
     return field(indices @ matrix[:3, :3].T + matrix[:3, 3])
 
 
+@pytest.mark.slow
 def test_a_known_field_comes_back(sweep):
     made = reconstruct(plan(sweep, Compounding(spacing=0.5e-3)))
     error = np.abs(made.volume.intensities - truth(made))[made.covered]
