@@ -86,7 +86,7 @@ def test_a_case_gets_the_moduli_of_its_press(tmp_path, capsys):
     wrenches = felt_in(f"case:{case}", "tissue", 11e3, path)
     recording = session(tmp_path / "bag", path, record_of(path, wrenches))
     out = tmp_path / "fitted.yaml"
-    words = ["fit-stiffness", str(case), recording, "--out", str(out), "--poses", "12"]
+    words = ["fit-stiffness", recording, "--case", str(case), "--out", str(out), "--poses", "12"]
     assert main([*words, "--into-case"]) == 0
     assert "has these moduli now" in capsys.readouterr().out
     changed = read_case(case)
