@@ -193,8 +193,8 @@ def _run_node(
     output.close()
     for stream in sys.stdout, sys.stderr:
         stream.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+    prepare_process(name)  # setproctitle finds its place beside the environment that was there
     os.environ.clear()
     os.environ.update(environment)
     sys.argv = [name, *arguments]
-    prepare_process(name)
     sys.exit(importlib.import_module(module).main(arguments))
