@@ -123,7 +123,7 @@ def _worst_depth(
     return depth, float(means["expected"][worst]), float(means["shown"][worst])
 
 
-BLOCK = (-6e-3, 14e-3), (5.2e-3, 18e-3)  # m, x and z of a block of bone
+BLOCK = (-6e-3, 5.2e-3), (14e-3, 18e-3)  # m, x and z of a block of bone
 STATES = {
     "rest": (np.eye(3), 0.0),
     # Pressed by 12 %, which makes it wider, and sheared.
