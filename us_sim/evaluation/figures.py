@@ -151,11 +151,12 @@ def draw_image_grid(grid: Mapping[str, Mapping[str, NDArray[Any]]], title: str) 
     columns = list(dict.fromkeys(name for row in grid.values() for name in row))
     figure = _empty(title, 2.7 * len(columns) + 0.9, 2.9 * len(grid) + 0.6)
     axes = figure.subplots(len(grid), len(columns), squeeze=False)
+    for panel, column in zip(axes[0], columns, strict=True):
+        panel.set_title(column, fontsize=9)
     for line, (name, row) in zip(axes, grid.items(), strict=True):
         line[0].set_ylabel(name, fontsize=9)
         for panel, column in zip(line, columns, strict=True):
             panel.set(xticks=[], yticks=[], facecolor="0.85")
-            panel.set_title(column if line is axes[0] else "", fontsize=9)
             if column in row:
                 panel.imshow(row[column], "gray", interpolation="nearest", vmin=0.0, vmax=255.0)
     return figure
