@@ -17,8 +17,7 @@ import yaml
 
 from us_sim.errors import UsSimError
 
-LARGEST_YAML = 1 << 20
-"""Characters of a text that is read."""
+LARGEST_YAML = 1 << 20  # characters of a text that is read
 
 
 class YamlError(UsSimError):
