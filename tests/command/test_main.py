@@ -1,5 +1,7 @@
 """The command's error paths: one sentence, status 1, no traceback."""
 
+import errno
+import io
 import os
 import subprocess
 import sys
@@ -8,6 +10,7 @@ import pytest
 
 from us_sim.command.main import main
 from us_sim.progress import Progress
+from us_sim.recording.writer import BagWriter
 from us_sim.run.supervision import SupervisionSettings, Supervisor, say
 
 LONG = "x" * 300  # more than a file's name may have
@@ -76,6 +79,24 @@ def test_links_that_lead_in_a_circle_are_one_sentence(args, tmp_path, monkeypatc
     assert error.startswith("us-sim: ")
     assert error.count("\n") == 1
     assert args[-1].rpartition("/")[2] in error or "LOOP" in error
+
+
+class Full(io.StringIO):
+    """A stream to a full disk."""
+
+    def write(self, _):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("stream", [None, Full()])
+def test_without_standard_error_work_goes_on(stream, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(sys, "stderr", stream)
+    assert main(["bag", "info", "nowhere.mcap"]) == 1
+    file = tmp_path / "a.mcap"
+    BagWriter(file).close()
+    assert main(["bag", "repair", str(file)]) == 0
+    assert "0 messages are in" in capsys.readouterr().out
+    assert sys.stderr is stream
 
 
 def test_what_strangers_say_moves_no_cursor_and_fills_no_screen(capsys):

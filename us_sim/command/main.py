@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import os
 import signal
 import sys
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
 from us_sim.errors import UsSimError, printable
 
@@ -79,6 +81,7 @@ def main(args: Sequence[str] | None = None) -> int:
         raise _Interrupted
 
     before = {number: signal.signal(number, interrupt) for number in _ENDINGS}
+    said, sys.stderr = sys.stderr, cast(TextIO, _Lasting(sys.stderr))
     try:
         from us_sim.run.domain import take_ros_arguments
 
@@ -104,8 +107,28 @@ def main(args: Sequence[str] | None = None) -> int:
             raise
         return _interrupted()  # a library that is broken off while it is imported fails in its way
     finally:
+        sys.stderr = said
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+class _Lasting:
+    """Standard error that may be closed, or lead to a full disk: no work ends for that."""
+
+    def __init__(self, stream: TextIO | None) -> None:
+        self._stream = stream or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 def _parser() -> ChosenParser:
