@@ -61,6 +61,8 @@ class Piece:
     measure: Callable[[], Iterable[Mapping[str, Any]]]
 
     def __str__(self) -> str:
+        if "case" in self.case:
+            return str(self.case["case"])
         return ", ".join(_cell(value, ".4g") for value in list(self.case.values())[:4])
 
 
