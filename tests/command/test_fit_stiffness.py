@@ -15,7 +15,6 @@ from us_sim.scene.building import materials_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.settings.reading import Reader
 from us_sim.tissue.stiffness_fit import press_wrenches
-from us_sim.volume.cases.case import read_case
 from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.writing import write_volume
@@ -71,7 +70,7 @@ def test_what_is_no_press_is_one_sentence(small_scene, tmp_path, capsys, spoil, 
 
 
 @pytest.mark.slow
-def test_a_case_gets_the_moduli_of_its_press(tmp_path, capsys):
+def test_the_moduli_of_a_case_are_found_from_its_press(tmp_path):
     grid = np.diag([2e-3, 2e-3, 2e-3, 1.0])
     grid[:3, 3] = [-0.04, -0.03, 0.0]
     grey = np.random.default_rng(1).integers(60, 120, (40, 30, 25), dtype=np.uint8)
@@ -87,10 +86,7 @@ def test_a_case_gets_the_moduli_of_its_press(tmp_path, capsys):
     recording = session(tmp_path / "bag", path, record_of(path, wrenches))
     out = tmp_path / "fitted.yaml"
     words = ["fit-stiffness", recording, "--case", str(case), "--out", str(out), "--poses", "12"]
-    assert main([*words, "--into-case"]) == 0
-    assert "has these moduli now" in capsys.readouterr().out
-    changed = read_case(case)
-    assert changed.settings.material_of("tissue").young_modulus == pytest.approx(11e3, rel=0.03)
+    assert main(words) == 0
     scene = load_scene(out)
     assert scene.volume.case == str(case)
     assert scene.tissue is not None

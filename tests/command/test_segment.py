@@ -33,7 +33,7 @@ def block():
 
 @pytest.fixture
 def case(tmp_path):
-    """The block's, unlabelled, with a structure's material and a tissue of before."""
+    """The block's, unlabelled, with a structure's material."""
     structures = {"vein": CaseStructure(3, material="artery"), "bone": CaseStructure(1)}
     with new_case(tmp_path / "arm") as folder:
         write_volume(folder / "volume.nrrd", block())
@@ -42,7 +42,6 @@ def case(tmp_path):
         fixed = ("bottom", "bone")
         settings = CaseSettings("arm", "", "", probe, start, structures=structures, fixed=fixed)
         write_case_settings(folder, settings)
-        (folder / "tissue.npz").write_bytes(b"of other labels")
     return tmp_path / "arm"
 
 
@@ -69,8 +68,6 @@ def test_seeds_make_labels_surfaces_and_a_picture(case, seeds, capsys):
     assert (case / "segmentation.png").read_bytes()[:4] == b"\x89PNG"
     vein = 4 * 20 * 3 * 8e-3  # ml
     assert f"{vein:.3f} ml" in said
-    assert "tissue.npz was made of other labels" in said
-    assert not (case / "tissue.npz").exists()
     assert opened.settings.structures["vein"].material == "artery"
     assert opened.settings.fixed == ("bottom",)
     labels = read_labels(case / "labels.nrrd", volume)

@@ -18,7 +18,7 @@ from us_sim.command.options import (
     read_settings,
     scene_name,
 )
-from us_sim.errors import BagError, SceneError, StiffnessError
+from us_sim.errors import BagError, SceneError
 from us_sim.settings.spelling import aligned
 from us_sim.share import full_path
 from us_sim.tissue.stiffness_fit import StiffnessSettings
@@ -33,9 +33,6 @@ def fit_stiffness_options(parser: argparse.ArgumentParser) -> None:
     add_scene_options(parser)
     parser.add_argument("session", type=Path, help="recording with the probe's poses and wrenches")
     add_setting_options(parser, StiffnessSettings)
-    parser.add_argument(
-        "--into-case", action="store_true", help="write the moduli into the case, too"
-    )
     parser.set_defaults(command=_fit)
 
 
@@ -48,8 +45,6 @@ def _fit(args: argparse.Namespace) -> int:
     settings = read_settings(args, StiffnessSettings)
     name = scene_name(args)
     scene = load_scene(name, volume=args.volume)
-    if args.into_case and not scene.volume.case:
-        raise StiffnessError("--into-case: this scene is of no case; name one with --case")
     section = scene.tissue
     if section is None:
         raise SceneError(f"{scene.origin}: tissue: is missing, so that there is nothing to press")
@@ -69,11 +64,6 @@ def _fit(args: argparse.Namespace) -> int:
     _write_scene(settings.out, found, _base(name, scene), scene.name)
     _draw(settings.out.with_suffix(".png"), found)
     print(f"{settings.out}: a scene with these moduli; its .png: how they fit")
-    if args.into_case and scene.volume.case:
-        from us_sim.volume.cases.writing import write_constants_into
-
-        write_constants_into(scene.volume.case, _constants(found))
-        print(f"{scene.volume.case}: has these moduli now")
     return 0
 
 

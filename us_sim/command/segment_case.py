@@ -16,7 +16,7 @@ import numpy as np
 from us_sim.errors import CaseError, VolumeError
 from us_sim.settings.spelling import aligned
 from us_sim.share import shared_roots
-from us_sim.volume.cases.case import LABELS, SURFACES, TISSUE, VOLUME, read_case
+from us_sim.volume.cases.case import LABELS, SURFACES, VOLUME, read_case
 from us_sim.volume.cases.proposal import with_proposal
 from us_sim.volume.cases.settings import RESERVED, CaseSettings, CaseStructure
 from us_sim.volume.cases.writing import write_case_settings
@@ -62,9 +62,6 @@ def segment_as_asked(asked: SegmentRequest, progress: Progress = lambda *_: None
         draw_segmentation(volume, labels, partial)
     if not _keeps_labels(asked):
         write_labels(folder / LABELS, volume, labels.colours)
-        if (folder / TISSUE).exists():
-            (folder / TISSUE).unlink()
-            remarks.append(f"{TISSUE} was made of other labels and is removed")
     write_case_settings(folder, settings)
     shutil.rmtree(folder / SURFACES, ignore_errors=True)
     (folder / SURFACES).mkdir()

@@ -244,7 +244,7 @@ def recorder_of(processes: Iterable[NodeProcess]) -> SessionRecorderSettings | N
 def prepare_scene(scene: Scene, path: Path | None = None, topic: str | None = None) -> None:
     """Make a phantom that is not in the cache yet, in view of the person who waits.
 
-    The tissue of a case is made too, and kept in the case. Of a phantom that is there nothing is
+    The tissue of a case is made too, and kept there. Of a phantom that is there nothing is
     read, unless a path is played: its nodes do that, and notice damage.
 
     Args:

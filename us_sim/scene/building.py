@@ -313,10 +313,10 @@ def _mesh(
             remarks = (*remarks, f"it is in {parts} parts that touch nowhere")
         return mesh, remarks, label_fractions_of(mesh, volume)
     if isinstance(given.nodes, int):
-        from us_sim.scene.case_tissue import box_tissue, kept_tissue
+        from us_sim.scene.case_tissue import box_tissue
 
-        tissue = kept_tissue(scene) or box_tissue(scene, volume)
-        return tissue.mesh, (), tissue.label_fractions if volume.labels is not None else None
+        mesh, fractions = box_tissue(scene, volume)
+        return mesh, (), fractions if volume.labels is not None else None
     from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 
     assert given.lower is not None

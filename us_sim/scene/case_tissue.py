@@ -1,4 +1,4 @@
-"""Scenes made from cases: their keys, and their box of tissue, which is kept in the case.
+"""Scenes made from cases: their keys, and their box of tissue, which is kept.
 
 Frame ``patient`` is the probe's where it touches the skin at the case's start: its origin is the
 middle of the probe's face, and +z goes into the body.
@@ -12,14 +12,14 @@ middle of the probe's face, and +z goes into the body.
 from __future__ import annotations
 
 import hashlib
-import logging
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import CaseError
+from us_sim.cache import Form, kept
 from us_sim.geometry.collider import Capsule, Collider, Sphere
 from us_sim.geometry.pose import Placement, Pose
 from us_sim.geometry.transducer import ProbeSettings
@@ -27,12 +27,11 @@ from us_sim.scene.scene import Scene
 from us_sim.settings.reading import document_of
 from us_sim.settings.registry import COLLIDERS, PROBES
 from us_sim.tissue.elasticity.material import LAYERS, kind_of
-from us_sim.tissue.elasticity.materials import label_fractions
+from us_sim.tissue.elasticity.materials import LabelFractions, label_fractions
 from us_sim.tissue.mesh.box_planes import fitted_planes, spacing_by_labels, spacing_under_probe
-from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
-from us_sim.volume.cases.case import LABELS, TISSUE, Case, read_case
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
+from us_sim.volume.cases.case import LABELS, Case, read_case
 from us_sim.volume.cases.settings import AROUND, SLIDE, CaseSettings
-from us_sim.volume.cases.tissue import CaseTissue, read_tissue, write_tissue
 from us_sim.volume.volume import Volume, grid_extent
 
 _BESIDE = 0.013  # m, of tissue beside the probe
@@ -40,6 +39,8 @@ _BELOW = 1.05
 """Depth of the tissue over that of the image: tissue that moves against the volume beside it would
 leave a seam in the image."""
 _THINNEST = 0.02  # m, to which the tissue is cut where the volume ends
+_GENERATOR = 1
+"""Part of the cache's key: raise it when a change here, or in what this calls, changes a mesh."""
 
 
 def case_document(folder: Path) -> dict[str, Any]:
@@ -171,65 +172,55 @@ def counts(scene: Scene, label: str) -> bool:
     return label in named and label not in scene.tissue.fixed and kind_of(label) not in LAYERS
 
 
-_logger = logging.getLogger(__name__)
-
-
-def kept_tissue(scene: Scene) -> CaseTissue | None:
-    """The tissue in the scene's case, if it is the one that this scene would make.
-
-    One that cannot be read is said in a warning, and not used.
-    """
-    if scene.volume.case is None or not _is_fitted(scene):
-        return None
-    path = Path(scene.volume.case) / TISSUE
-    if not path.is_file():
-        return None
-    try:
-        kept = read_tissue(path)
-    except CaseError as error:
-        _logger.warning("%s", error)
-        return None
-    return kept if kept.made_from == _made_from(scene) else None
-
-
 def keep_tissue(scene: Scene, volume: Volume) -> None:
-    """Make the tissue and keep it in the scene's case, unless it is there or cannot be kept.
+    """Make the tissue of the scene's case, unless it is in the user's cache folder already.
 
     Raises:
         MeshError: no mesh can be made.
     """
-    if scene.volume.case is None or not _is_fitted(scene) or kept_tissue(scene) is not None:
-        return
-    try:
-        write_tissue(Path(scene.volume.case) / TISSUE, box_tissue(scene, volume))
-    except CaseError as error:
-        _logger.warning("%s; it is made in every run", error)
+    tissue = scene.tissue
+    if tissue is not None and not tissue.mesh.file and isinstance(tissue.mesh.nodes, int):
+        box_tissue(scene, volume)
 
 
-def box_tissue(scene: Scene, volume: Volume) -> CaseTissue:
-    """The box of a scene whose nodes are put where they count, and the labels in it.
+def box_tissue(scene: Scene, volume: Volume) -> tuple[TetrahedralMesh, LabelFractions]:
+    """Return the box of a scene whose nodes are put where they count, and the labels in it.
+
+    That of a case is taken from the user's cache folder, and kept there.
 
     Raises:
         MeshError: no mesh can be made of so few nodes.
     """
-    assert scene.tissue is not None
-    made_from = _made_from(scene) if scene.volume.case is not None else {}
-    mesh = box_mesh(*box_planes(scene, volume))
-    if volume.labels is None:
-        labels, fractions = np.zeros(1, np.uint8), np.ones((len(mesh.tetrahedra), 1))
-    else:
-        labels, fractions = label_fractions(mesh, volume.labels, volume.patient_to_index)
-    return CaseTissue(mesh, labels, fractions, made_from)
+
+    def make() -> tuple[TetrahedralMesh, LabelFractions]:
+        mesh = box_mesh(*box_planes(scene, volume))
+        if volume.labels is None:
+            everything = np.ones((len(mesh.tetrahedra), 1))
+            return mesh, LabelFractions(np.zeros(1, np.uint8), everything)
+        return mesh, label_fractions(mesh, volume.labels, volume.patient_to_index)
+
+    if scene.volume.case is None:
+        return make()
+    return kept(_key(scene), Form("tissue.json", _pack, _unpack), make)
 
 
-def _is_fitted(scene: Scene) -> bool:
-    """Whether nodes are put where they count."""
-    tissue = scene.tissue
-    return tissue is not None and not tissue.mesh.file and isinstance(tissue.mesh.nodes, int)
+def _pack(
+    tissue: tuple[TetrahedralMesh, LabelFractions],
+) -> tuple[dict[str, NDArray], dict[str, Any]]:
+    mesh, fractions = tissue
+    assert mesh.planes is not None  # boxes have planes
+    return dict(zip("xyz", mesh.planes, strict=True)) | fractions._asdict(), {}
 
 
-def _made_from(scene: Scene) -> dict[str, Any]:
-    """All that the tissue follows from, as JSON gives it back."""
+def _unpack(
+    arrays: dict[str, NDArray], _: dict[str, Any]
+) -> tuple[TetrahedralMesh, LabelFractions]:
+    mesh = box_mesh(*(arrays[axis] for axis in "xyz"))
+    return mesh, LabelFractions(arrays["labels"], arrays["fractions"])
+
+
+def _key(scene: Scene) -> str:
+    """Return a file name of all that the tissue follows from."""
     assert scene.tissue is not None
     assert scene.probe.collider is not None
     assert scene.volume.case is not None
@@ -239,7 +230,7 @@ def _made_from(scene: Scene) -> dict[str, Any]:
     if (folder / LABELS).is_file():
         with (folder / LABELS).open("rb") as stream:
             checksum = hashlib.file_digest(stream, "sha256").hexdigest()
-    return {
+    made_from = {
         "lower": list(mesh.lower or ()),
         "upper": list(mesh.upper or ()),
         "nodes": mesh.nodes,
@@ -249,3 +240,5 @@ def _made_from(scene: Scene) -> dict[str, Any]:
         "orientation": list(pose.orientation),
         "labels": checksum,
     }
+    digest = hashlib.sha256(json.dumps([_GENERATOR, made_from]).encode()).hexdigest()
+    return f"tissue-{digest[:16]}"

@@ -1,8 +1,8 @@
 """A case: a folder with everything that is needed to scan and press on one body part.
 
 ``case.yaml`` says what it is (`us_sim.volume.cases.settings`), ``volume.nrrd`` holds its grey
-values and ``labels.nrrd`` on the same grid what each voxel is; ``surfaces/`` and ``tissue.npz``
-may be there. All names are these: a case names no files of its own choice.
+values and ``labels.nrrd`` on the same grid what each voxel is; ``surfaces/`` may be
+there. All names are these: a case names no files of its own choice.
 
 Folders of cases are those in the environment variable US_SIM_CASES, or the folder ``cases`` in the
 user's data folder. A case is named by its folder in one of them, or by its path.
@@ -35,7 +35,6 @@ CASE = "case.yaml"
 VOLUME = "volume.nrrd"
 LABELS = "labels.nrrd"
 SURFACES = "surfaces"
-TISSUE = "tissue.npz"
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,11 +6,10 @@ is removed. Of a case that is there each file is replaced whole.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import shutil
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,10 +17,9 @@ import yaml
 
 from us_sim.errors import CaseError, VolumeError
 from us_sim.settings.reading import document_of
-from us_sim.settings.spelling import unknown
 from us_sim.volume.cases.case import CASE, read_case
 from us_sim.volume.cases.proposal import with_proposal
-from us_sim.volume.cases.settings import AROUND, CaseSettings, check_name
+from us_sim.volume.cases.settings import CaseSettings, check_name
 from us_sim.volume.partial_file import partial_file
 
 
@@ -68,34 +66,6 @@ def write_case_settings(folder: Path, settings: CaseSettings) -> None:
     )
     with partial_file(folder / CASE, error_type=CaseError) as partial:
         partial.write_text(text, encoding="utf-8")
-
-
-def write_constants_into(
-    folder: str | os.PathLike[str], constants: Mapping[str, Mapping[str, float]]
-) -> None:
-    """Write constants of materials into a case.
-
-    Args:
-        folder: of the case.
-        constants: such as ``young_modulus`` (Pa), by structure, `AROUND` for tissue outside of all.
-
-    Raises:
-        CaseError: there is no such case or structure, or it cannot be written.
-        MaterialError: a constant is out of range.
-    """
-    case = read_case(folder)
-    settings = case.settings
-    structures, around = dict(settings.structures), settings.around
-    for name, changed in constants.items():
-        if name not in (AROUND, *structures):
-            raise CaseError(f"{settings.name}: structure {unknown(name, (AROUND, *structures))}")
-        material = dataclasses.replace(settings.material_of(name), **changed)
-        if name == AROUND:
-            around = material
-        else:
-            structures[name] = dataclasses.replace(structures[name], material=material)
-    settings = dataclasses.replace(settings, around=around, structures=structures)
-    write_case_settings(case.folder, settings)
 
 
 def _finish(folder: Path, partial: Path) -> None:
