@@ -13,8 +13,8 @@ scale of its own.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,6 @@ from us_sim.errors import VolumeError
 from us_sim.settings.spelling import counted
 from us_sim.volume.deidentification.settings import ImportSettings, Rectangle
 from us_sim.volume.files.dicom.header import (
-    DicomFile,
     dicom_files,
     groups_of,
     is_dicom,
@@ -37,8 +36,12 @@ from us_sim.volume.files.dicom.header import (
     text,
 )
 from us_sim.volume.files.dicom.pixels import ImageFormat
-from us_sim.volume.files.dicom.placed_images import is_flat, opened_images, placed_images
-from us_sim.volume.files.dicom.planes import frame_times
+from us_sim.volume.files.dicom.placed_images import (
+    frame_times,
+    is_flat,
+    opened_images,
+    placed_images,
+)
 from us_sim.volume.files.readers import ENDINGS, open_image
 from us_sim.volume.files.segments import refuse_segments
 from us_sim.volume.files.stored_image import grey_voxels, volume_of_slices
@@ -52,14 +55,6 @@ Scale = tuple[float, float]  # mm, width and height of a pixel
 _VOLUMES = (".nrrd", ".mha", ".nii", ".nii.gz")
 
 
-@dataclass(frozen=True)
-class Region:
-    """A region of echoes that a header states."""
-
-    part: Rectangle
-    pixel_mm: Scale | None  # None: its header does not state it
-
-
 @dataclass(frozen=True, eq=False)
 class Source:
     """Images of one volume or of one recording, as they come."""
@@ -69,7 +64,8 @@ class Source:
     images: Callable[[NDArray[np.bool_] | None], Iterator[NDArray[np.uint8]]]
     conversions: tuple[str, ...]  # of the stored values
     placement: NDArray[np.float64] | None  # (4, 4) m, from (column, row, image); None: no volume
-    regions: tuple[Region, ...] = ()  # of echoes, as the header says
+    # of echoes, as the header says, with the size of their pixels where it is stated
+    regions: Mapping[Rectangle, Scale | None] = field(default_factory=dict)
     doubt: str = ""  # why it states none, or is not believed
     needs_part: bool = False  # images that may show a name outside the regions
     times: Sequence[float] = ()  # s, of images that are no volume
@@ -199,38 +195,18 @@ def look_at(
             f"{out}: its name ends as no volume's does; write {', '.join(_VOLUMES)}, .igs.mha for "
             f"2D images, or a folder's name without an ending for a case"
         )
-    return _planned(paths[0], out, settings, _source(paths, out, settings))
-
-
-def _source(paths: list[Path], out: Path | None, settings: ImportSettings) -> Source:
-    spacing = settings.spacing_mm
-    others = [path for path in paths if path.name.lower().endswith(ENDINGS)]
-    if len(paths) == 1 and others:
-        if len(spacing) == 2:
-            raise VolumeError("--spacing: write three numbers for a volume: X,Y,Z")
-        return _of_file(paths[0], settings.volume, spacing or None)
-    if strange := [*others, *(path for path in paths if not is_dicom(path))]:
-        raise refuse_other(
-            strange[0],
-            "is no DICOM file; give DICOM files of one series, or one MHA, NRRD or NIfTI volume",
-        )
-    needs_volume = out is not None and not out.name.lower().endswith(".mha")
-    return _of_dicom(paths, settings.volume, spacing, needs_volume=needs_volume)
-
-
-def _planned(path: Path, out: Path | None, settings: ImportSettings, source: Source) -> Import:
-    """Find out what of every image is kept, and its scale."""
+    path, source = paths[0], _source(paths, out, settings)
     columns, rows, _ = source.shape
     whole = Rectangle(0, 0, columns - 1, rows - 1)
     part = settings.part or whole
     if part.common(whole) != part:
         raise VolumeError(f"--crop {part}: is larger than the images, which are {whole}")
-    regions = () if settings.keep_whole_image else source.regions
-    shown = tuple(filter(None, (part.common(region.part) for region in regions)))
+    regions = {} if settings.keep_whole_image else source.regions
+    shown = tuple(filter(None, map(part.common, regions)))
     if regions and not shown:
         raise VolumeError(
             f"--crop {part}: shows nothing of the ultrasound regions "
-            f"{', '.join(str(region.part) for region in regions)}; keep a part of these, or give "
+            f"{', '.join(map(str, regions))}; keep a part of these, or give "
             f"--keep-whole-image with it if there is nothing to hide"
         )
     undecided = []
@@ -260,10 +236,10 @@ def _scale(path: Path, source: Source, part: Rectangle, given: tuple[float, ...]
     """
     if len(given) == 3:
         raise VolumeError("--spacing: write two numbers for 2D images, X,Y")
-    inside = [region for region in source.regions if part.common(region.part)]
-    scales = {region.pixel_mm for region in inside}
+    inside = {region: size for region, size in source.regions.items() if part.common(region)}
+    scales = set(inside.values())
     if len(scales) > 1:
-        each = (f"--crop {region.part} ({_millimetres(region.pixel_mm)})" for region in inside)
+        each = (f"--crop {region} ({_millimetres(size)})" for region, size in inside.items())
         raise ValueError(f"its regions have different sizes of pixels: give {', or '.join(each)}")
     stated = next(iter(scales), None) or source.pixel_mm
     if stated and given:
@@ -277,14 +253,26 @@ def _millimetres(pixel: Scale | None) -> str:
     return f"{pixel[0]:.4g} × {pixel[1]:.4g} mm" if pixel else "of a size that is not stated"
 
 
-def _of_file(path: Path, volume: int, spacing: tuple[float, ...] | None) -> Source:
-    """Open a MetaImage, NRRD or NIfTI volume, whose images are the slices along its last axis."""
-    image = open_image(path, layers=True, spacing=spacing)
-    refuse_segments(path, image.texts)
-    image.check(layers=False)
-    placement = image.placement()
-    voxels, conversions = grey_voxels(image, volume)
-    return Source(image.shape, lambda _: iter(voxels.transpose(2, 1, 0)), conversions, placement)
+def _source(paths: list[Path], out: Path | None, settings: ImportSettings) -> Source:
+    """Open one MetaImage, NRRD or NIfTI volume, whose images are the slices, or DICOM files."""
+    spacing = settings.spacing_mm
+    others = [path for path in paths if path.name.lower().endswith(ENDINGS)]
+    if len(paths) == 1 and others:
+        if len(spacing) == 2:
+            raise VolumeError("--spacing: write three numbers for a volume: X,Y,Z")
+        image = open_image(paths[0], layers=True, spacing=spacing or None)
+        refuse_segments(paths[0], image.texts)
+        image.check()
+        placement = image.placement()
+        voxels, said = grey_voxels(image, settings.volume)
+        return Source(image.shape, lambda _: iter(voxels.transpose(2, 1, 0)), said, placement)
+    if strange := [*others, *(path for path in paths if not is_dicom(path))]:
+        raise refuse_other(
+            strange[0],
+            "is no DICOM file; give DICOM files of one series, or one MHA, NRRD or NIfTI volume",
+        )
+    needs_volume = out is not None and not out.name.lower().endswith(".mha")
+    return _of_dicom(paths, settings.volume, spacing, needs_volume=needs_volume)
 
 
 def _of_dicom(
@@ -306,8 +294,8 @@ def _of_dicom(
         conversions.append(f"volume {volume} of {placed.volumes} in time")
     regions, doubt = _ultrasound_regions(first, images.form)
     if any(_ultrasound_regions(file, images.form)[0] != regions for file in images.files):
-        regions, doubt = (), "the files have different ultrasound regions"
-    burned = any(text(file.header, "BurnedInAnnotation") == "YES" for file in images.files)
+        regions, doubt = {}, "the files have different ultrasound regions"
+    burned = any(text(file, "BurnedInAnnotation") == "YES" for file in images.files)
     return Source(
         (images.form.columns, images.form.rows, len(which)),
         lambda keep: images.images(which, keep),
@@ -321,10 +309,12 @@ def _of_dicom(
     )
 
 
-def _ultrasound_regions(file: DicomFile, form: ImageFormat) -> tuple[tuple[Region, ...], str]:
+def _ultrasound_regions(
+    header: Any, form: ImageFormat
+) -> tuple[dict[Rectangle, Scale | None], str]:
     """Return the regions of echoes; none, with the reason, if one of the header's cannot be."""
-    kept = []
-    for region in items(file.header, "SequenceOfUltrasoundRegions"):
+    kept = {}
+    for region in items(header, "SequenceOfUltrasoundRegions"):
         keys = ("MinX0", "MinY0", "MaxX1", "MaxY1")
         found = [number(region, f"RegionLocation{key}") for key in keys]
         edges = [-1 if each is None else int(each) for each in found]
@@ -334,11 +324,11 @@ def _ultrasound_regions(file: DicomFile, form: ImageFormat) -> tuple[tuple[Regio
         is_within = edges[2] <= form.columns and edges[3] <= form.rows
         if min(edges) < 0 or min(part.size) < 1 or not is_within:
             doubt = f"a region is {edges} in an image of {form.columns} × {form.rows} pixels"
-            return (), doubt
+            return {}, doubt
         kinds = number(region, "RegionSpatialFormat"), number(region, "RegionDataType")
         if kinds in ((1, 1), (1, 2)):  # two-dimensional, of tissue or of colour flow
-            kept.append(Region(part, _region_scale(region)))
-    return tuple(kept), "" if kept else "there is no ultrasound region of tissue or flow"
+            kept[part] = _region_scale(region)
+    return kept, "" if kept else "there is no ultrasound region of tissue or flow"
 
 
 def _region_scale(region: Any) -> Scale | None:
@@ -349,11 +339,11 @@ def _region_scale(region: Any) -> Scale | None:
     return float(f"{abs(x) * 10.0:.7g}"), float(f"{abs(y) * 10.0:.7g}")
 
 
-def _stated_scale(file: DicomFile) -> Scale | None:
+def _stated_scale(header: Any) -> Scale | None:
     """Read `PixelSpacing`, or its counterpart in secondary captures."""
-    groups = groups_of(file.header, int(number(file.header, "NumberOfFrames") or 1))[0]
+    groups = groups_of(header, int(number(header, "NumberOfFrames") or 1))[0]
     measures = (each for group in groups for each in items(group, "PixelMeasuresSequence"))
-    for source in (file.header, *measures):
+    for source in (header, *measures):
         # Between rows, then between columns (PS3.3, 10.7.1.3).
         for key in ("PixelSpacing", "NominalScannedPixelSpacing"):
             stated = numbers(source, key, 2)

@@ -77,7 +77,7 @@ def check_memory(needed: float, purpose: str, advice: str = "end other programs"
         )
 
 
-def check_claim(path: Path, size: tuple[int, ...], value: int) -> None:
+def check_claim(path: Path | str, size: tuple[int, ...], value: int) -> None:
     """Refuse an image of so many numbers along each axis, and so many bytes a number.
 
     Raises:

@@ -21,23 +21,13 @@ class Grid:
     shape: tuple[int, int, int]
 
     @property
-    def voxels(self) -> int:
-        """How many there are."""
-        return math.prod(self.shape)
-
-    @property
     def spacing(self) -> float:
         """m, from a voxel to the next."""
         return float(np.linalg.norm(self.index_to_reference[:3, 0]))
 
-    @property
-    def reference_to_index(self) -> NDArray[np.float64]:
-        """(4, 4) from m to indices."""
-        return np.asarray(np.linalg.inv(self.index_to_reference), dtype=np.float64)
-
 
 def grid_around(points: NDArray[np.float64], spacing: float) -> Grid:
-    """The grid whose first and last voxels hold the outermost points.
+    """Return the grid whose first and last voxels hold the outermost points.
 
     Args:
         points: (N, 3) m.
@@ -71,7 +61,7 @@ def grid_around(points: NDArray[np.float64], spacing: float) -> Grid:
 
 
 def proposed_spacing(points: NDArray[np.float64], pixel: float) -> float:
-    """m: a pixel's size, or as much more as 134 million voxels around the points need."""
+    """Return m: a pixel's size, or as much more as 134 million voxels around the points need."""
     size = np.maximum(np.ptp(points, axis=0), pixel)
     needed = (math.prod(size) / (1 << 27)) ** (1 / 3)
     return pixel if needed <= pixel else math.ceil(1e5 * needed * 1.01) / 1e5

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,29 +43,6 @@ class Plan:
     compounding: Compounding
     rest: Rest | None = None  # where the tissue of a frame lies at rest
 
-    @property
-    def hole_radius(self) -> float:
-        """m; two voxels where nobody says."""
-        asked = self.compounding.hole_radius
-        return 2.0 * self.grid.spacing if asked is None else asked
-
-    @cached_property
-    def _points(self) -> NDArray[np.float64]:
-        """(N, 3) of the used pixels in an image: column, row and 0."""
-        rows, columns = np.nonzero(self.used)
-        return np.column_stack([columns, rows, np.zeros(len(rows))])
-
-    def places(self, k: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return points (N, 3) of a frame's used pixels, and what takes them to the grid (3, 4).
-
-        They are at rest where that is known.
-        """
-        points = self._points
-        to_index, matrix = self.grid.reference_to_index, self.sweep.image_to_reference[k]
-        if self.rest is None:
-            return points, (to_index @ matrix)[:3]
-        return self.rest(k, points @ matrix[:3, :3].T + matrix[:3, 3]), to_index[:3]
-
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
@@ -82,7 +59,7 @@ def plan(
     part: ImagePart | None = None,
     rest: Rest | None = None,
 ) -> Plan:
-    """The grid around a sweep's images, and which of their pixels are used.
+    """Find the grid around a sweep's images, and which of their pixels are used.
 
     Args:
         sweep: with poses.
@@ -114,7 +91,7 @@ def plan(
 
 
 def reconstruct(planned: Plan, progress: Progress | None = None) -> Reconstruction:
-    """The volume of a sweep's images.
+    """Make the volume of a sweep's images.
 
     Args:
         planned: the sweep and its grid.
@@ -128,18 +105,27 @@ def reconstruct(planned: Plan, progress: Progress | None = None) -> Reconstructi
     frames = len(sweep.numbers)
     tell = progress or (lambda *_: None)
     shown = " × ".join(map(str, shape))
-    check_memory(10 * planned.grid.voxels, f"a volume of {shown} voxels", "give a larger --spacing")
+    voxels = f"a volume of {shown} voxels"
+    check_memory(10 * math.prod(shape), voxels, "give a larger --spacing")
     total, count = np.zeros(shape, np.uint32), np.zeros(shape, np.uint32)
-    for k, image in enumerate(sweep.images()):
+    rows, columns = np.nonzero(planned.used)
+    pixels = np.column_stack([columns, rows, np.zeros(len(rows))])
+    to_index = np.linalg.inv(planned.grid.index_to_reference)
+    placed = zip(sweep.images(), sweep.image_to_reference, strict=True)
+    for k, (image, matrix) in enumerate(placed):
         tell(_FILLING * k / frames, "inserting images")
-        points, to_index = planned.places(k)
-        insert_pixels(image[planned.used], points, np.ascontiguousarray(to_index), total, count)
+        points, to_grid = pixels, to_index @ matrix
+        if planned.rest is not None:
+            points = planned.rest(k, pixels @ matrix[:3, :3].T + matrix[:3, 3])
+            to_grid = to_index
+        insert_pixels(image[planned.used], points, to_grid[:3], total, count)
     grey, covered = mean_values(total, count)
     del total, count
     if not covered.any():
         raise VolumeError(f"{sweep.path}: no pixel of its images lies in the grid")
     tell(_FILLING, "filling holes")
-    filled = fill_holes(grey, covered, planned.hole_radius / planned.grid.spacing)
+    asked = planned.compounding.hole_radius
+    filled = fill_holes(grey, covered, 2.0 if asked is None else asked / planned.grid.spacing)
     tell(1.0, "")
     volume = Volume(grey, planned.grid.index_to_reference)
     return Reconstruction(volume, covered, filled)

@@ -7,13 +7,17 @@ import os
 import warnings
 from collections.abc import Iterator, MutableSequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from us_sim.errors import VolumeError
 
 EXTRA = "pip install 'us_sim[dicom]'"
+EXPORT = (
+    "export a maker's own 3D data as Enhanced US Volume, or save it as .nrrd in 3D Slicer with "
+    "SlicerHeart"
+)
+"""Advice for GE's Kretz and movie groups, Philips' and Siemens' volumes."""
 
 
 @contextmanager
@@ -74,16 +78,8 @@ def groups_of(header: Any, frames: int) -> list[tuple[Any, ...]]:
     return [(group, *shared) for group in own] if len(own) == frames else [()] * frames
 
 
-@dataclass(frozen=True, eq=False)
-class DicomFile:
-    """A DICOM file that was opened."""
-
-    path: Path
-    header: Any  # pydicom.Dataset, whose values are read by the functions above
-
-
 def is_dicom(path: Path) -> bool:
-    """Whether a file begins as DICOM does, or as older files do, without a preamble."""
+    """Tell whether a file begins as DICOM does, or as older files do, without a preamble."""
     with path.open("rb") as file:
         start = file.read(132)
     return start[128:] == b"DICM" or (start[:2] in (b"\x02\0", b"\x08\0") and not any(start[3:4]))
@@ -107,8 +103,8 @@ def dicom_files(folder: Path) -> list[Path]:
     return found
 
 
-def open_dicom(path: str | os.PathLike[str]) -> DicomFile:
-    """Read a DICOM file."""
+def open_dicom(path: str | os.PathLike[str]) -> Any:
+    """Read a DICOM file: a `pydicom.FileDataset`, for the functions above."""
     path = Path(path)
     if not path.is_file():
         raise VolumeError(f"{path}: there is no such file")
@@ -121,7 +117,7 @@ def open_dicom(path: str | os.PathLike[str]) -> DicomFile:
         raise VolumeError(f"{path}: is no DICOM file: it does not begin as one does")
     try:
         with quiet():
-            header = dcmread(path, force=True)
+            header = dcmread(str(path), force=True)
     except Exception as error:  # of many kinds, which may show values
         raise VolumeError(
             f"{path}: cannot be read as DICOM: its header is damaged or cut; copy it again"
@@ -130,4 +126,4 @@ def open_dicom(path: str | os.PathLike[str]) -> DicomFile:
         implicit = header.original_encoding[0] is not False
         syntax = ImplicitVRLittleEndian if implicit else ExplicitVRLittleEndian
         header.file_meta.TransferSyntaxUID = syntax
-    return DicomFile(path, header)
+    return header

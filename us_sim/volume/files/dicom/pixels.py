@@ -17,15 +17,14 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.files.dicom.header import (
+    EXPORT,
     EXTRA,
-    DicomFile,
     groups_of,
     items,
     number,
     numbers,
     quiet,
 )
-from us_sim.volume.files.dicom.planes import EXPORT
 from us_sim.volume.files.stored_image import GreyLevels, check_claim
 
 _WEIGHTS = np.array([77, 150, 29])
@@ -46,11 +45,11 @@ class ImageFormat:
     used_bits: int  # of a number that count
 
 
-def image_format(file: DicomFile) -> ImageFormat:
+def image_format(header: Any) -> ImageFormat:
     """Read the format that a header states, and compare it with the bytes that there are."""
     from pydicom.pixels.utils import get_expected_length, get_nr_frames
 
-    header, path = file.header, file.path
+    path = header.filename
     keys = ("PixelData", "FloatPixelData", "DoubleFloatPixelData")
     pixels = next((header[key] for key in keys if key in header), None)
     if pixels is None:
@@ -88,9 +87,7 @@ def image_format(file: DicomFile) -> ImageFormat:
     return form
 
 
-def stored_frames(
-    file: DicomFile, form: ImageFormat, frames: Sequence[int]
-) -> Iterator[NDArray[Any]]:
+def stored_frames(file: Any, form: ImageFormat, frames: Sequence[int]) -> Iterator[NDArray[Any]]:
     """Yield images of a file, (rows, columns) or (rows, columns, RGB), by their numbers."""
     from pydicom.pixels import iter_pixels
 
@@ -98,11 +95,11 @@ def stored_frames(
         if _has_twelve_bit_jpeg(file):
             import SimpleITK as sitk
 
-            every = sitk.GetArrayFromImage(sitk.ReadImage(str(file.path)))
+            every = sitk.GetArrayFromImage(sitk.ReadImage(str(file.filename)))
             yield from every.reshape(-1, form.rows, form.columns)[list(frames)]
             return
         with quiet():
-            found = iter_pixels(file.header, indices=list(frames))
+            found = iter_pixels(file, indices=list(frames))
         for _ in frames:
             with quiet():
                 image = next(found)
@@ -111,29 +108,29 @@ def stored_frames(
             yield image
     except Exception as error:  # pydicom and its decoders raise many kinds of errors
         raise VolumeError(
-            f"{file.path}: its images cannot be decoded ({' '.join(str(error).split())}); copy or "
-            f"export it again, or install the decoders: {EXTRA}"
+            f"{file.filename}: its images cannot be decoded ({' '.join(str(error).split())}); copy "
+            f"or export it again, or install the decoders: {EXTRA}"
         ) from error
 
 
-def _has_twelve_bit_jpeg(file: DicomFile) -> bool:
-    """Whether images are in an encoding that pydicom's decoders read with 8 bits alone."""
-    syntax = str(file.header.file_meta.TransferSyntaxUID)
-    return syntax == "1.2.840.10008.1.2.4.51" and file.header.get("BitsStored", 8) > 8
+def _has_twelve_bit_jpeg(file: Any) -> bool:
+    """Tell whether images are in an encoding that pydicom's decoders read with 8 bits alone."""
+    syntax = str(file.file_meta.TransferSyntaxUID)
+    return syntax == "1.2.840.10008.1.2.4.51" and file.get("BitsStored", 8) > 8
 
 
-def _grey_palette(file: DicomFile) -> tuple[int, NDArray[np.uint8]]:
+def _grey_palette(file: Any) -> tuple[int, NDArray[np.uint8]]:
     """Return the stored value that a colour table begins with, and the grey value of each."""
     from pydicom.pixels import apply_color_lut
 
     try:
-        count, first, _ = map(int, numbers(file.header, "RedPaletteColorLookupTableDescriptor", 3))
+        count, first, _ = map(int, numbers(file, "RedPaletteColorLookupTableDescriptor", 3))
         with quiet():
             every = np.arange(first, first + (count or 1 << 16))
-            colours = apply_color_lut(every, file.header)[..., :3]
+            colours = apply_color_lut(every, file)[..., :3]
     except Exception as error:
         raise VolumeError(
-            f"{file.path}: its table of colours is missing or damaged; export it in grey or RGB"
+            f"{file.filename}: its table of colours is missing or damaged; export it in grey or RGB"
         ) from error
     # Some writers give numbers of 8 bits in entries of 16.
     top = 65535.0 if colours.max() > 255 else 255.0
@@ -143,15 +140,16 @@ def _grey_palette(file: DicomFile) -> tuple[int, NDArray[np.uint8]]:
 class GreyImages:
     """The images of files that belong together, by (number of the file, number of the image)."""
 
-    def __init__(self, files: Sequence[DicomFile]) -> None:
+    def __init__(self, files: Sequence[Any]) -> None:
         self.files = list(files)
+        self.path: str = self.files[0].filename  # which errors name
         self.formats = [image_format(file) for file in self.files]
         self.form = self.formats[0]
         for file, form in zip(self.files, self.formats, strict=True):
             if replace(form, frames=self.form.frames) != self.form:
                 raise VolumeError(
-                    f"{file.path}: its images are of another size or type than those of "
-                    f"{self.files[0].path}; import them one by one"
+                    f"{file.filename}: its images are of another size or type than those of "
+                    f"{self.path}; import them one by one"
                 )
         self._inverted = self.form.photometric == "MONOCHROME1"
         self._is_palette = self.form.photometric == "PALETTE COLOR"
@@ -185,7 +183,7 @@ class GreyImages:
         levels = GreyLevels()
         if not self._plain:
             kept = (each if keep is None else each[keep] for each in self._brightness(which))
-            levels = GreyLevels.over(self.files[0].path, kept)
+            levels = GreyLevels.over(self.path, kept)
         for image in self._brightness(which):
             grey = levels(image)
             if self._inverted:
@@ -212,7 +210,7 @@ class GreyImages:
                 _slope_and_offset(*(each for group in groups for each in items(group, key)), header)
                 for groups in groups_of(header, form.frames)
             ]
-            for header, form in zip((f.header for f in self.files), self.formats, strict=True)
+            for header, form in zip(self.files, self.formats, strict=True)
         ]
 
     def _brightness(self, which: Sequence[tuple[int, int]]) -> Iterator[NDArray[Any]]:
