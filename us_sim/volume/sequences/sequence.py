@@ -16,7 +16,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -40,46 +40,6 @@ SEQUENCE_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nhdr")
 
 _GIVE = "give a sequence of Plus or 3D Slicer (.igs.mha, .igs.nrrd, .seq.nrrd)"
 
-NO_TIME = "no Timestamp"
-NO_IMAGE = "ImageStatus is not OK"
-NO_FIELDS = "no field in the header"  # why frames cannot be used
-
-
-@dataclass(frozen=True)
-class StoredImages:
-    """Images, grey or red, green and blue; other numbers than bytes are spread over all frames."""
-
-    numbers: StoredNumbers
-    columns: int  # as they are stored
-    rows: int
-    channels: int  # 1 or 3
-    orientation: str
-
-    def read(self, wanted: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
-        """Yield grey images (rows, columns) of some frames, turned to ``MF``."""
-        import cv2  # which a node that plays poses alone does not need
-
-        for number in wanted:
-            image = self._levels(self._stored[..., number].T)
-            if self.channels > 1:
-                image = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-            yield np.ascontiguousarray(turned(image, self.orientation))
-
-    @cached_property
-    def _stored(self) -> NDArray[Any]:
-        """(columns, rows, frames), or (channels, columns, rows, frames), as they are."""
-        each = (self.channels, self.columns, self.rows)[self.channels == 1 :]
-        return self.numbers.read().reshape((*each, -1), order="F")
-
-    @cached_property
-    def _levels(self) -> GreyLevels:
-        if self.numbers.type == np.uint8:
-            return GreyLevels()
-        frames = (self._stored[..., n] for n in range(self._stored.shape[-1]))
-        return GreyLevels.over(
-            self.numbers.header, (each.T.reshape(self.rows, -1) for each in frames)
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class TrackedSequence:
@@ -94,21 +54,43 @@ class TrackedSequence:
     image_is_valid: NDArray[np.bool_]  # (K,) by its status
     transforms: Mapping[str, FrameTransforms]  # by name, such as ProbeToTracker
     are_colours: bool  # the images are stored in colours and read in grey
-    _stored: StoredImages | VolumeError
+    orientation: str  # of the images as they are stored
+    stored: StoredNumbers | VolumeError  # of the images, or why they cannot be read
 
     def __len__(self) -> int:
         return len(self.numbers)
 
-    def require_images(self) -> StoredImages:
-        """The images in the file."""
-        if isinstance(self._stored, VolumeError):
-            raise self._stored
-        return self._stored
+    def require_images(self) -> StoredNumbers:
+        """Return the images as they are stored; raise what is wrong with them."""
+        if isinstance(self.stored, VolumeError):
+            raise self.stored
+        return self.stored
 
     def images(self, which: Iterable[int] | None = None) -> Iterator[NDArray[np.uint8]]:
-        """The images (rows, columns) in grey, turned to ``MF``; of these indices into `numbers`."""
-        indices = range(len(self)) if which is None else which
-        return self.require_images().read(int(self.numbers[i]) for i in indices)
+        """Yield images (rows, columns) in grey, turned to ``MF``; those at indices in `numbers`.
+
+        Other numbers than bytes are spread over all frames.
+        """
+        import cv2  # which a node that plays poses alone does not need
+
+        numbers = self.numbers if which is None else self.numbers[list(which)]
+        for number in numbers:
+            image = self._levels(self._images[..., number].T)
+            if self.are_colours:
+                image = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+            yield np.ascontiguousarray(turned(image, self.orientation))
+
+    @cached_property
+    def _images(self) -> NDArray[Any]:
+        """(columns, rows, frames), or (channels, columns, rows, frames), as they are stored."""
+        return self.require_images().read()
+
+    @cached_property
+    def _levels(self) -> GreyLevels:
+        if self._images.dtype == np.uint8:
+            return GreyLevels()
+        frames = (self._images[..., n].T for n in range(self.count))
+        return GreyLevels.over(self.path, (each.reshape(len(each), -1) for each in frames))
 
 
 def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
@@ -147,7 +129,7 @@ def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
     frames = [described[number] for number in numbers]
     # Older versions of Plus write the key with blanks.
     code = keys.get("UltrasoundImageOrientation", keys.get("ultrasound image orientation", "MF"))
-    stored: StoredImages | VolumeError
+    stored: StoredNumbers | VolumeError
     try:
         stored = _stored_images(path, keys, start, (columns, rows, channels, count), code)
     except VolumeError as error:  # for whoever asks for them
@@ -164,13 +146,14 @@ def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
         np.array([fields.get("ImageStatus", "OK").upper() == "OK" for fields in frames]),
         read_transforms(frames),
         channels > 1,
+        code,
         stored,
     )
 
 
 def _stored_images(
     path: Path, keys: Mapping[str, Any], start: int, size: tuple[int, int, int, int], code: str
-) -> StoredImages:
+) -> StoredNumbers:
     """Describe the images, as (columns, rows, channels, frames)."""
     columns, rows, channels, count = size
     kind = keys.get("UltrasoundImageType", keys.get("ultrasound image type", "BRIGHTNESS")).upper()
@@ -184,8 +167,8 @@ def _stored_images(
         problem = f"its images are {kind}, no B-mode: give the logarithm of their envelopes"
     else:
         is_nrrd = path.name.lower().endswith((".nrrd", ".nhdr"))
-        read = nrrd_numbers if is_nrrd else metaimage_numbers
-        return StoredImages(read(path, keys, start), columns, rows, channels, code)
+        numbers = (nrrd_numbers if is_nrrd else metaimage_numbers)(path, keys, start)
+        return replace(numbers, size=(channels, columns, rows, count)[channels == 1 :])
     raise VolumeError(f"{path}: {problem}")
 
 

@@ -13,13 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.sequences.sequence import (
-    NO_FIELDS,
-    NO_IMAGE,
-    NO_TIME,
-    TrackedSequence,
-    read_sequence,
-)
+from us_sim.volume.sequences.sequence import TrackedSequence, read_sequence
 from us_sim.volume.sequences.transforms import (
     FrameTransforms,
     TransformChain,
@@ -27,7 +21,6 @@ from us_sim.volume.sequences.transforms import (
     shortest_chain,
 )
 
-IMAGE, REFERENCE = "Image", "Reference"
 _LONGEST_GAP = 0.3  # s, between poses that are interpolated; three frames of a slow scanner
 
 
@@ -47,24 +40,24 @@ class Sweep:
     sequence: TrackedSequence
 
     def images(self, which: Iterable[int] | None = None) -> Iterator[NDArray[np.uint8]]:
-        """The images (rows, columns): all, or those at these indices into `numbers`."""
+        """Yield images (rows, columns): all, or those at these indices into `numbers`."""
         numbers = self.numbers if which is None else self.numbers[list(which)]
-        return self.sequence.require_images().read(int(number) for number in numbers)
+        return self.sequence.images(np.searchsorted(self.sequence.numbers, numbers).tolist())
 
 
 def read_sweep(path: str | os.PathLike[str]) -> Sweep:
-    """The images of a sequence file whose transforms lead from its image to a reference frame."""
+    """Read a sequence file whose transforms lead from its image to a reference frame."""
     return sweep_of(read_sequence(path))
 
 
 def sweep_of(
     sequence: TrackedSequence,
     *,
-    image: str = IMAGE,
-    reference: str = REFERENCE,
+    image: str = "Image",
+    reference: str = "Reference",
     calibration: Mapping[str, NDArray[np.float64]] | None = None,
 ) -> Sweep:
-    """The images of a sequence, each placed by a chain of transforms.
+    """Place each image of a sequence by a chain of transforms.
 
     Frames whose transform or time stamp is missing, not finite or singular, or whose status is
     not OK, are left out and counted.
@@ -100,12 +93,12 @@ def sweep_of(
     placed = along(known, chain)
     faults = list(placed.faults)
     for k in np.flatnonzero(np.isnan(sequence.times)):
-        faults[k] = faults[k] or NO_TIME
+        faults[k] = faults[k] or "no Timestamp"
     for k in np.flatnonzero(~sequence.image_is_valid):
-        faults[k] = NO_IMAGE
+        faults[k] = "ImageStatus is not OK"
     left_out = dict(Counter(filter(None, faults)))
     if sequence.count > len(sequence):
-        left_out[NO_FIELDS] = sequence.count - len(sequence)
+        left_out["no field in the header"] = sequence.count - len(sequence)
     used = np.array([not fault for fault in faults], dtype=bool)
     if not used.any():
         why = ", ".join(f"{number} with {reason}" for reason, number in left_out.items())
@@ -127,20 +120,31 @@ def sweep_of(
 
 
 def shifted(sweep: Sweep, offset: float) -> Sweep:
-    """The sweep with each image where the probe was ``offset`` seconds after its time stamp.
+    """Place each image where the probe was ``offset`` seconds after its time stamp.
 
-    Args:
-        sweep: with poses.
-        offset: s, to add to the images' times to find their poses.
+    Between two poses the middle of the image moves straight, and all else turns about it; where
+    none is near in time, the image is left out.
     """
-    middle = np.array([0.5 * (sweep.columns - 1), 0.5 * (sweep.rows - 1), 0.0])
-    placed = _poses_at(sweep, sweep.times + offset, middle)
-    used = np.isfinite(placed).all(axis=(1, 2))
+    from scipy.spatial.transform import Rotation, Slerp  # which takes a tenth of a second
+
+    times, first = np.unique(sweep.times, return_index=True)
+    matrices, wanted = sweep.image_to_reference[first], sweep.times + offset
+    after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
+    used = (times[0] <= wanted) & (wanted <= times[-1])
+    used &= times[after] - times[after - 1] <= _LONGEST_GAP
     if not used.any():
         raise VolumeError(
             f"{sweep.path}: no image has a pose {1e3 * offset:g} ms after its time; give a time "
             f"offset within the {np.ptp(sweep.times):.2g} s of the sweep"
         )
+    wanted, base = wanted[used], matrices[0, :3, :3]
+    turns = Slerp(times, Rotation.from_matrix(matrices[:, :3, :3] @ np.linalg.inv(base)))
+    middle = np.array([0.5 * (sweep.columns - 1), 0.5 * (sweep.rows - 1), 0.0])
+    middles = matrices[:, :3, :3] @ middle + matrices[:, :3, 3]
+    moved = np.stack([np.interp(wanted, times, each) for each in middles.T], axis=-1)
+    placed = np.tile(np.eye(4), (len(wanted), 1, 1))
+    placed[:, :3, :3] = turns(wanted).as_matrix() @ base
+    placed[:, :3, 3] = moved - placed[:, :3, :3] @ middle
     left_out = dict(sweep.left_out)
     if not used.all():
         left_out["no pose at its time"] = int((~used).sum())
@@ -148,33 +152,6 @@ def shifted(sweep: Sweep, offset: float) -> Sweep:
         sweep,
         numbers=sweep.numbers[used],
         times=sweep.times[used],
-        image_to_reference=placed[used],
+        image_to_reference=placed,
         left_out=left_out,
     )
-
-
-def _poses_at(
-    sweep: Sweep, wanted: NDArray[np.float64], middle: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """(N, 4, 4) poses of images between those that were measured; nan where none is near in time.
-
-    The middle (3,) of the image moves straight from one to the next, and all else turns about it.
-    """
-    from scipy.spatial.transform import Rotation, Slerp  # which takes a tenth of a second
-
-    times, first = np.unique(sweep.times, return_index=True)
-    matrices = sweep.image_to_reference[first]
-    after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
-    is_within = (times[0] <= wanted) & (wanted <= times[-1])
-    used = is_within & (times[after] - times[after - 1] <= _LONGEST_GAP)
-    placed = np.full((len(wanted), 4, 4), np.nan)
-    if used.any():
-        base = matrices[0, :3, :3]
-        turns = Slerp(times, Rotation.from_matrix(matrices[:, :3, :3] @ np.linalg.inv(base)))
-        turned = turns(wanted[used]).as_matrix() @ base
-        middles = matrices[:, :3, :3] @ middle + matrices[:, :3, 3]
-        moved = np.stack([np.interp(wanted[used], times, each) for each in middles.T], axis=-1)
-        placed[used] = np.eye(4)
-        placed[used, :3, :3] = turned
-        placed[used, :3, 3] = moved - turned @ middle
-    return placed
