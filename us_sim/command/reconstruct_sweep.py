@@ -14,7 +14,7 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.cases.writing import new_case, write_case_settings
-from us_sim.volume.files.writing import write_volume
+from us_sim.volume.files.writing import VOLUME_ENDINGS, write_volume
 from us_sim.volume.reconstruction.calibration_file import SweepCalibration, read_calibration
 from us_sim.volume.reconstruction.reconstruction import (
     Progress,
@@ -23,9 +23,8 @@ from us_sim.volume.reconstruction.reconstruction import (
     reconstruct,
 )
 from us_sim.volume.reconstruction.scanning_probe import scanning_probe
-from us_sim.volume.reconstruction.settings import VOLUME_ENDINGS, Compounding, ImagePart
-from us_sim.volume.sequences.sequence import read_sequence
-from us_sim.volume.sequences.sweep import Sweep, shifted, sweep_of
+from us_sim.volume.reconstruction.settings import Compounding, ImagePart
+from us_sim.volume.sequences.sweep import Sweep, read_sweep, shifted
 
 
 @dataclass(frozen=True)
@@ -106,8 +105,8 @@ def reconstruct_sweep(
     if settings.calibration is not None:
         calibration = read_calibration(settings.calibration, settings.probe)
     part = part if part != ImagePart() else calibration.part
-    sweep = sweep_of(
-        read_sequence(settings.sweep),
+    sweep = read_sweep(
+        settings.sweep,
         image=settings.image,
         reference=settings.reference,
         calibration=calibration.transforms,

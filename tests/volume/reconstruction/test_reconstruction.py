@@ -22,8 +22,7 @@ from us_sim.volume.reconstruction.grid import (
 from us_sim.volume.reconstruction.insertion import fill_holes, insert_pixels, mean_values
 from us_sim.volume.reconstruction.reconstruction import plan, reconstruct
 from us_sim.volume.reconstruction.settings import Compounding, ImagePart
-from us_sim.volume.sequences.sequence import read_sequence
-from us_sim.volume.sequences.sweep import read_sweep, shifted, sweep_of
+from us_sim.volume.sequences.sweep import read_sweep, shifted
 
 PIXEL = 0.5e-3  # m
 ROWS, COLUMNS, FRAMES = 40, 30, 25
@@ -214,8 +213,8 @@ def test_volumes_of_plus_come_out_as_plus_made_them(shared_file, name):
     calibration = read_calibration(
         folder / f"Config_VolumeReconstruction_{configuration}.xml", "Probe"
     )
-    sequence = read_sequence(folder / "SpinePhantomFreehand.igs.mha")
-    sweep = sweep_of(sequence, calibration=calibration.transforms)
+    path = folder / "SpinePhantomFreehand.igs.mha"
+    sweep = read_sweep(path, calibration=calibration.transforms)
     how = Compounding(spacing=0.5e-3, hole_radius=0.0)
     made = reconstruct(plan(sweep, how, calibration.part))
     reference = read_volume(folder / f"VolumeReconstructorTest{name}volumeRef.mha")

@@ -12,8 +12,7 @@ from us_sim.volume.reconstruction.calibration_file import read_calibration
 from us_sim.volume.reconstruction.grid import image_mask
 from us_sim.volume.reconstruction.scanning_probe import Fan, Rectangle, fitted_part, scanning_probe
 from us_sim.volume.reconstruction.settings import ImagePart
-from us_sim.volume.sequences.sequence import read_sequence
-from us_sim.volume.sequences.sweep import read_sweep, sweep_of
+from us_sim.volume.sequences.sweep import read_sweep
 
 ROWS, COLUMNS = 300, 400
 SIDE = np.array([0.5e-3, 0.5e-3])
@@ -126,8 +125,8 @@ def test_the_linear_array_of_a_real_sweep_is_found(
     shared_file, folder, configuration, recording, begin, size, within
 ):
     calibration = read_calibration(shared_file(folder) / configuration, "Probe")
-    sequence = read_sequence(shared_file(folder) / recording)
-    sweep = sweep_of(sequence, calibration=calibration.transforms)
+    path = shared_file(folder) / recording
+    sweep = read_sweep(path, calibration=calibration.transforms)
     used = image_mask(calibration.part, sweep.columns, sweep.rows)
     found = scanning_probe(sweep, calibration.part, used)
     assert found.probe.geometry == "linear"

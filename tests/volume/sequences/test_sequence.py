@@ -9,7 +9,7 @@ import SimpleITK as sitk
 
 from us_sim.errors import VolumeError
 from us_sim.volume.sequences.sequence import read_sequence
-from us_sim.volume.sequences.sweep import read_sweep, sweep_of
+from us_sim.volume.sequences.sweep import read_sweep
 from us_sim.volume.sequences.transforms import in_metres
 
 FRAMES, ROWS, COLUMNS = 3, 4, 5
@@ -230,10 +230,9 @@ def test_the_real_liver_sweep_is_what_simpleitk_reads(shared_file):
 
 def test_a_chain_by_way_of_the_tracker_places_images_of_plus_as_its_formula_says(shared_file):
     path = shared_file("plus-spine-freehand/SpinePhantomFreehand.igs.mha")
-    sequence = read_sequence(path)
     calibration = np.diag([0.08, 0.08, 0.08, 1.0])
     calibration[:3, 3] = (15.4, 49.6, -8.6)  # mm
-    sweep = sweep_of(sequence, calibration={"ImageToProbe": in_metres("ImageToProbe", calibration)})
+    sweep = read_sweep(path, calibration={"ImageToProbe": in_metres("ImageToProbe", calibration)})
     assert [name for name, _ in sweep.chain.steps] == [
         "ImageToProbe",
         "ProbeToTracker",

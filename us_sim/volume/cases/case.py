@@ -182,16 +182,10 @@ def find_case(name: str | os.PathLike[str], folders: Sequence[Path] = ()) -> Pat
         return case.resolve()
     if any(place.exists() for place in places):
         raise CaseError(f"{name}: is no case, as it has no {CASE}; `us-sim cases` lists some")
-    known = sorted(named)
-    if places and path.name != str(path):
-        beside = {place.parent for place in places if place.parent.is_dir()}
-        known = [
-            str(path.with_name(case.name)) for one in beside for case in cases_in(one)
-        ] or known
-    if not known:
+    if not named:
         where = ", ".join(map(str, case_roots()))
         raise CaseError(f"there is no case {name}, and none at all in {where}")
-    raise CaseError(f"there is no such case: {unknown(str(name), known)}")
+    raise CaseError(f"there is no such case: {unknown(str(name), sorted(named))}")
 
 
 @dataclass(frozen=True)

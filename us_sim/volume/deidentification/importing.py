@@ -45,14 +45,12 @@ from us_sim.volume.files.dicom.placed_images import (
 from us_sim.volume.files.readers import ENDINGS, open_image
 from us_sim.volume.files.segments import refuse_segments
 from us_sim.volume.files.stored_image import grey_voxels, volume_of_slices
-from us_sim.volume.files.writing import write_image_sequence, write_volume
+from us_sim.volume.files.writing import VOLUME_ENDINGS, write_image_sequence, write_volume
 from us_sim.volume.partial_file import partial_file
 from us_sim.volume.volume import Volume
 
 Progress = Callable[[float, str], None]
 Scale = tuple[float, float]  # mm, width and height of a pixel
-
-_VOLUMES = (".nrrd", ".mha", ".nii", ".nii.gz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +140,7 @@ class Import:
         placement = self.source.placement.copy()
         placement[:, 3] = placement @ [self.part.left, self.part.top, 0.0, 1.0]
         volume = Volume(volume_of_slices(self._images(progress), count), placement)
-        if out.name.lower().endswith(_VOLUMES):
+        if out.name.lower().endswith(VOLUME_ENDINGS):
             write_volume(out, volume)
             return
         from us_sim.volume.cases.settings import CaseSettings
@@ -190,9 +188,14 @@ def look_at(
         paths += dicom_files(each) if each.is_dir() else [each]
     if out is not None and os.path.lexists(out):
         raise VolumeError(f"{out}: exists already; choose another name, or remove it")
-    if out and out.suffix and not out.name.lower().endswith(_VOLUMES) and len(out.suffix) <= 5:
+    if (
+        out
+        and out.suffix
+        and not out.name.lower().endswith(VOLUME_ENDINGS)
+        and len(out.suffix) <= 5
+    ):
         raise VolumeError(
-            f"{out}: its name ends as no volume's does; write {', '.join(_VOLUMES)}, .igs.mha for "
+            f"{out}: its name ends as no volume's does; write {', '.join(VOLUME_ENDINGS)}, .igs.mha for "
             f"2D images, or a folder's name without an ending for a case"
         )
     path, source = paths[0], _source(paths, out, settings)

@@ -82,13 +82,14 @@ def metaimage_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
 
     def placement() -> NDArray[np.float64]:
         """(4, 4) m of the first three axes; the matrix has one axis after another."""
+        no_turn = " ".join(map(str, np.eye(count).ravel()))
         unit = millimetres(path, fields.get("DistanceUnits", "mm"))
         spacing, origin, axes = (
             _numbers(path, fields, length, *keys, default=default)
             for length, keys, default in (
                 (count, ("ElementSpacing", "ElementSize"), "nan " * count),
                 (count, ("Offset", "Position", "Origin"), "0 " * count),
-                (count**2, ("TransformMatrix", "Rotation", "Orientation"), _unit_matrix(count)),
+                (count**2, ("TransformMatrix", "Rotation", "Orientation"), no_turn),
             )
         )
         stated = None if np.isnan(spacing).all() else unit * spacing[:3]
@@ -97,10 +98,6 @@ def metaimage_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
 
     components = numbers.size[0] if len(numbers.size) > count else 1
     return StoredImage(path, numbers.size, numbers.type, components, placement, numbers.read)
-
-
-def _unit_matrix(count: int) -> str:
-    return " ".join(f"{one:g}" for one in np.eye(count).ravel())
 
 
 def _numbers(

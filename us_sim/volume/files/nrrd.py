@@ -124,13 +124,13 @@ def _placement(
         )
     if _DIRECTIONS not in fields:
         units = fields.get("units", [""] * (axes[-1] + 1))
-        scale = np.array([_millimetres(path, units[n]) for n in axes])
+        scale = np.array([millimetres(path, units[n]) for n in axes])
         stated = np.asarray(fields.get("spacings", np.full(axes[-1] + 1, np.nan)))[axes] * scale
         starts = np.asarray(fields.get("axis mins", np.zeros(axes[-1] + 1)))[axes]
         spacing = None if np.isnan(stated).all() else stated
         return checked_placement(path, spacing, np.eye(3), np.nan_to_num(starts) * scale, given)
     to_lps = np.array(_TO_LPS[space], np.float64)
-    to_lps *= [_millimetres(path, unit) for unit in fields.get("space units", [""] * 3)]
+    to_lps *= [millimetres(path, unit) for unit in fields.get("space units", [""] * 3)]
     steps = np.asarray(fields[_DIRECTIONS])[axes].T
     origin = np.asarray(fields.get("space origin", np.zeros(3)))
     if steps.shape != (3, 3) or origin.shape != (3,):
@@ -139,7 +139,3 @@ def _placement(
     spacing = np.linalg.norm(steps, axis=0)
     direction = steps / np.where(spacing > 0.0, spacing, 1.0)
     return checked_placement(path, spacing, direction, origin * to_lps, given)
-
-
-def _millimetres(path: Path, unit: str) -> float:
-    return millimetres(path, "" if unit.lower() in ("???", "none") else unit)

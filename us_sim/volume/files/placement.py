@@ -24,13 +24,13 @@ def millimetres(path: Path | str, unit: str) -> float:
     for known in (name, name.removesuffix("s").replace("metre", "meter")):
         if known in MILLIMETRES:
             return MILLIMETRES[known]
-    if name in ("", "?"):
+    if name in ("", "?", "???", "none"):
         return 1.0
     raise VolumeError(f"{path}: states its lengths in {unit!r}, which is no known unit: write mm")
 
 
 def is_right_angled(direction: NDArray[np.float64]) -> bool:
-    """Whether axes of length 1, the columns (3, 3), are at right angles but for rounding."""
+    """Tell whether axes of length 1, the columns (3, 3), are at right angles but for rounding."""
     return bool(np.abs(direction.T @ direction - np.eye(3)).max() <= _RIGHT_ANGLE)
 
 

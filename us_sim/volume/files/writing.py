@@ -20,7 +20,9 @@ from us_sim.volume.partial_file import partial_file
 from us_sim.volume.structure_names import Colour, anatomical_colour
 from us_sim.volume.volume import Volume
 
-_ENDINGS = (".seg.nrrd", ".nrrd", ".mha", ".nii.gz", ".nii")
+VOLUME_ENDINGS = (".nrrd", ".mha", ".nii.gz", ".nii")
+"""Of the names of files that volumes are written to."""
+
 _LEVEL = 1  # of compression: speckle hardly becomes smaller with any other
 
 
@@ -159,9 +161,9 @@ def _write_image(
             f"{path}: the volume's axes are {degrees_off(direction):.2g}° off a right angle, which "
             f"image files cannot hold; resample it on a grid with right angles"
         )
-    ending = next((end for end in _ENDINGS if path.name.lower().endswith(end)), None)
+    ending = next((end for end in VOLUME_ENDINGS if path.name.lower().endswith(end)), None)
     if ending is None:
-        raise VolumeError(f"{path}: its name must end in {', '.join(_ENDINGS)}")
+        raise VolumeError(f"{path}: its name must end in {', '.join(VOLUME_ENDINGS)}")
     with partial_file(path, f"image{ending}") as partial:
         if ending.startswith(".nii"):  # ITK refuses axes that are rounded
             import nibabel  # which takes half a second

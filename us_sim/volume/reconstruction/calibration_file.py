@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError, VolumeError
-from us_sim.settings.text_files import YamlError, load_yaml
+from us_sim.settings.text_files import read_yaml
 from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.transforms import frame_matrix, in_metres
 
@@ -30,7 +30,7 @@ class SweepCalibration:
 
 
 def read_calibration(path: Path, probe: str) -> SweepCalibration:
-    """The fixed transforms of a sweep.
+    """Read the fixed transforms of a sweep.
 
     Args:
         path: a configuration of Plus (.xml), or a matrix ``image_to_body`` (.yaml).
@@ -40,16 +40,10 @@ def read_calibration(path: Path, probe: str) -> SweepCalibration:
     Raises:
         VolumeError: the file cannot be read, or holds no calibration.
     """
+    if path.suffix.lower() == ".xml":
+        return _read_plus_configuration(path)
     try:
-        if path.suffix.lower() == ".xml":
-            return _plus(path, ElementTree.parse(path).getroot())
-        document = load_yaml(path.read_text("utf-8"))
-    except OSError as error:
-        raise VolumeError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ElementTree.ParseError, UnicodeDecodeError, YamlError) as error:
-        raise VolumeError(f"{path}: is neither XML nor YAML that can be read: {error}") from error
-    try:
-        rows = document["image_to_body"]  # type: ignore[index,call-overload]
+        rows = read_yaml(path, VolumeError)["image_to_body"]
         text = " ".join(str(float(number)) for row in rows for number in row)
         matrix = frame_matrix({"image_to_body": text}, "image_to_body")
     except (LookupError, TypeError, ValueError) as error:
@@ -60,7 +54,12 @@ def read_calibration(path: Path, probe: str) -> SweepCalibration:
     return SweepCalibration({f"ImageTo{probe}": matrix}, ImagePart())
 
 
-def _plus(path: Path, root: ElementTree.Element) -> SweepCalibration:
+def _read_plus_configuration(path: Path) -> SweepCalibration:
+    """Read the transforms, and the part of the image that is tissue."""
+    try:
+        root = ElementTree.parse(path).getroot()
+    except (OSError, ElementTree.ParseError) as error:
+        raise VolumeError(f"{path}: cannot be read as XML: {error}") from error
     transforms = {}
     for element in root.iter("Transform"):
         start, end = element.get("From", ""), element.get("To", "")

@@ -64,7 +64,3 @@ class ImagePart(Settings):
                 raise self.refused(name, f"{pair[0]:g} must be less than {pair[1]:g}")
         if self.clip is not None and min(self.clip[2:]) <= 0.0:
             raise self.refused("clip", "must have columns and rows above zero")
-
-
-VOLUME_ENDINGS = (".nrrd", ".mha", ".nii", ".nii.gz")
-"""Of the names of files that volumes are written to."""

@@ -45,34 +45,30 @@ class Sweep:
         return self.sequence.images(np.searchsorted(self.sequence.numbers, numbers).tolist())
 
 
-def read_sweep(path: str | os.PathLike[str]) -> Sweep:
-    """Read a sequence file whose transforms lead from its image to a reference frame."""
-    return sweep_of(read_sequence(path))
-
-
-def sweep_of(
-    sequence: TrackedSequence,
+def read_sweep(
+    path: str | os.PathLike[str],
     *,
     image: str = "Image",
     reference: str = "Reference",
     calibration: Mapping[str, NDArray[np.float64]] | None = None,
 ) -> Sweep:
-    """Place each image of a sequence by a chain of transforms.
+    """Read a sequence file, and place each of its images by a chain of transforms.
 
     Frames whose transform or time stamp is missing, not finite or singular, or whose status is
     not OK, are left out and counted.
 
     Args:
-        sequence: with images.
+        path: of the sequence.
         image: the frame of the images' pixels.
         reference: the frame in which they are placed.
         calibration: transforms (4, 4), m (pixels of images), that hold for every frame, by name;
             they go before those of the sequence that have the same name.
 
     Raises:
-        VolumeError: the images cannot be read, no chain leads from one frame to the other, or no
-            frame can be used.
+        VolumeError: the file or its images cannot be read, no chain leads from one frame to the
+            other, or no frame can be used.
     """
+    sequence = read_sequence(path)
     sequence.require_images()
     count = len(sequence)
     known = dict(sequence.transforms)
