@@ -10,7 +10,6 @@ import numpy as np
 
 from us_sim.command.volume_pictures import draw_slices
 from us_sim.errors import VolumeError
-from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.cases.writing import new_case, write_case_settings
@@ -24,7 +23,7 @@ from us_sim.volume.reconstruction.reconstruction import (
 )
 from us_sim.volume.reconstruction.scanning_probe import scanning_probe
 from us_sim.volume.reconstruction.settings import Compounding, ImagePart
-from us_sim.volume.sequences.sweep import Sweep, read_sweep, shifted
+from us_sim.volume.sequences.sweep import Sweep, read_sweep
 
 
 @dataclass(frozen=True)
@@ -45,11 +44,6 @@ class SweepSettings(Settings):
     image: str = setting(description="name of the images' frame", default="Image")
     probe: str = setting(description="name of the tracked body's frame", default="Probe")
     reference: str = setting(description="name of the frame to reconstruct in", default="Reference")
-    time_offset: float = setting(
-        Quantity("time", -10.0, 10.0),
-        "to add to the images' times to find their poses",
-        default=0.0,
-    )
 
     def check(self) -> None:
         """Refuse a place that cannot be written to, which is worth knowing before the work."""
@@ -111,8 +105,6 @@ def reconstruct_sweep(
         reference=settings.reference,
         calibration=calibration.transforms,
     )
-    if settings.time_offset:
-        sweep = shifted(sweep, settings.time_offset)
     rest = None if rest_of is None else rest_of(sweep, part)
     planned = plan(sweep, compounding, part, rest)
     made = reconstruct(planned, progress=progress)

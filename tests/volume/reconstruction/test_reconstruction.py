@@ -22,7 +22,7 @@ from us_sim.volume.reconstruction.grid import (
 from us_sim.volume.reconstruction.insertion import fill_holes, insert_pixels, mean_values
 from us_sim.volume.reconstruction.reconstruction import plan, reconstruct
 from us_sim.volume.reconstruction.settings import Compounding, ImagePart
-from us_sim.volume.sequences.sweep import read_sweep, shifted
+from us_sim.volume.sequences.sweep import read_sweep
 
 PIXEL = 0.5e-3  # m
 ROWS, COLUMNS, FRAMES = 40, 30, 25
@@ -136,25 +136,6 @@ def test_a_grid_that_is_too_large_is_refused_before_it_is_made(sweep, monkeypatc
         reconstruct(planned)
     with pytest.raises(VolumeError, match="--spacing"):
         grid_around(np.array([[0.0, 0, 0], [0.01, 0.01, 0.001]]), 0.005)
-
-
-def test_late_stamps_are_undone(tmp_path):
-    matrices = path(wobble=0.05)
-    true = images_at(matrices)
-    # The image of frame k was taken at the pose of frame k + 1: the images come 50 ms late.
-    write_sweep(tmp_path / "late.igs.mha", np.roll(true, -1, axis=0), matrices)
-    late = read_sweep(tmp_path / "late.igs.mha")
-    mended = shifted(late, 0.05)
-    assert len(mended.numbers) == FRAMES - 1
-    assert mended.left_out == {"no pose at its time": 1}
-    np.testing.assert_allclose(mended.image_to_reference, matrices[1:], atol=1e-12)
-    half = shifted(late, 0.025).image_to_reference
-    centre = [COLUMNS / 2 - 0.5, ROWS / 2 - 0.5, 0, 1]
-    np.testing.assert_allclose(
-        half[3] @ centre, 0.5 * (matrices[3] + matrices[4]) @ centre, atol=1e-9
-    )
-    with pytest.raises(VolumeError, match="5000 ms"):
-        shifted(late, 5.0)
 
 
 def test_what_calibrate_probe_writes_is_read(tmp_path):

@@ -49,12 +49,6 @@ class Case:
         """Whether it is segmented."""
         return (self.folder / LABELS).is_file()
 
-    @property
-    def surfaces(self) -> dict[str, Path]:
-        """Files of surfaces, by the names of their structures."""
-        folder = self.folder / SURFACES
-        return {file.stem: file for file in sorted(folder.glob("*")) if file.is_file()}
-
     def placement(self) -> tuple[NDArray[np.float64], tuple[int, int, int]]:
         """Where its voxels are, from the header alone: (4, 4) m from indices, and the shape.
 

@@ -42,8 +42,8 @@ from us_sim.volume.files.dicom.placed_images import (
     opened_images,
     placed_images,
 )
+from us_sim.volume.files.labels import refuse_segments
 from us_sim.volume.files.readers import ENDINGS, open_image
-from us_sim.volume.files.segments import refuse_segments
 from us_sim.volume.files.stored_image import grey_voxels, volume_of_slices
 from us_sim.volume.files.writing import VOLUME_ENDINGS, write_image_sequence, write_volume
 from us_sim.volume.partial_file import partial_file
@@ -188,15 +188,10 @@ def look_at(
         paths += dicom_files(each) if each.is_dir() else [each]
     if out is not None and os.path.lexists(out):
         raise VolumeError(f"{out}: exists already; choose another name, or remove it")
-    if (
-        out
-        and out.suffix
-        and not out.name.lower().endswith(VOLUME_ENDINGS)
-        and len(out.suffix) <= 5
-    ):
+    if out and 1 < len(out.suffix) <= 5 and not out.name.lower().endswith(VOLUME_ENDINGS):
         raise VolumeError(
-            f"{out}: its name ends as no volume's does; write {', '.join(VOLUME_ENDINGS)}, .igs.mha for "
-            f"2D images, or a folder's name without an ending for a case"
+            f"{out}: its name ends as no volume's does; write {', '.join(VOLUME_ENDINGS)}, "
+            f".igs.mha for 2D images, or a folder's name without an ending for a case"
         )
     path, source = paths[0], _source(paths, out, settings)
     columns, rows, _ = source.shape

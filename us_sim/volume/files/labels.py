@@ -6,8 +6,11 @@ the names and colours of its segments.
 
 from __future__ import annotations
 
+import itertools
 import os
+import re
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +18,81 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from us_sim.errors import VolumeError
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import counted, shown
 from us_sim.volume.files.readers import open_image
-from us_sim.volume.files.segments import Segment, segments_of
 from us_sim.volume.files.stored_image import StoredImage
 from us_sim.volume.structure_names import Colour, is_anatomical, readable
 from us_sim.volume.volume import LabelMap, Volume
 
 _MOST = 255
+_FIELD = re.compile(r"Segment(\d{1,6})_(\w+)")
 _Known = dict[int, tuple[str, Colour | None]]
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One segment of a file."""
+
+    name: str
+    value: int  # of its voxels
+    layer: int
+    colour: Colour | None  # red, green, blue, 0 to 1
+
+
+def segments_of(path: Path, pairs: Mapping[str, str]) -> list[Segment]:
+    """Return the segments that a header's keys and values describe, in their order; often none.
+
+    Several segments share a layer as long as they do not overlap; in a layer each has a number.
+    Files of Slicer before 5 have a layer for each segment, in which it is 1
+    (slicer.readthedocs.io, "Segmentations", "Segmentation file (.seg.nrrd) file format").
+    """
+    for key in ("Segmentation_MasterRepresentation", "Segmentation_SourceRepresentation"):
+        if (said := pairs.get(key, "Binary labelmap")).lower() != "binary labelmap":
+            raise VolumeError(
+                f"{path}: holds segments as {shown(said)}; save it with `Binary labelmap` as the "
+                f"source representation"
+            )
+    found: dict[int, dict[str, str]] = {}
+    for key, value in pairs.items():
+        if match := _FIELD.fullmatch(key):
+            found.setdefault(int(match[1]), {})[match[2]] = value
+    shared = any("LabelValue" in fields for fields in found.values())
+    segments = []
+    for at, (number, fields) in enumerate(sorted(found.items())):
+        value = fields.get("LabelValue", "1")
+        layer = fields.get("Layer", "0" if shared else f"{at}")
+        if not (value.isdecimal() and int(value) and layer.isdecimal()):
+            raise VolumeError(
+                f"{path}: its Segment{number} has the LabelValue {shown(value)} and the Layer "
+                f"{shown(layer)}, where numbers belong, from 1 and 0 on; save it again"
+            )
+        segments.append(
+            Segment(
+                fields.get("Name", "").strip() or f"structure {number + 1}",
+                int(value),
+                int(layer),
+                _colour(fields.get("Color", "")),
+            )
+        )
+    return segments
+
+
+def refuse_segments(path: Path, pairs: Mapping[str, str]) -> None:
+    """Refuse a segmentation, by the keys of its header, where an image belongs."""
+    if any(map(_FIELD.fullmatch, pairs)):
+        raise VolumeError(
+            f"{path}: is a segmentation, which has labels and no grey values; give it to "
+            f"`us-sim segment CASE --labels {path.name}`"
+        )
+
+
+def _colour(text: str) -> Colour | None:
+    """Read a colour; where it is none, the structure's name suggests one."""
+    try:
+        red, green, blue = (float(word) for word in text.split())
+    except ValueError:
+        return None
+    return (red, green, blue) if all(0.0 <= part <= 1.0 for part in (red, green, blue)) else None
 
 
 def read_labels(
@@ -33,7 +102,7 @@ def read_labels(
     names: Mapping[int, str] | None = None,
     taken: Collection[str] = (),
 ) -> LabelMap:
-    """The labels in a file, on the grid of a volume.
+    """Read the labels in a file, on the grid of a volume.
 
     Of names that come from the file only those are kept that are made of anatomical
     words, since some hold a patient's; another structure is called by its number. Where segments
@@ -50,8 +119,13 @@ def read_labels(
     """
     path = Path(path)
     remarks: list[str] = []
-    labels, known, placement = _read(path, remarks)
-    labels, moved = on_grid(path, labels, placement, like.shape, like.index_to_patient)
+    image = open_image(path, layers=True)
+    segments, layers = segments_of(path, image.texts), _layers(path, image)
+    if segments:
+        labels, known = _from_segments(path, layers, segments, remarks)
+    else:
+        labels, known = _from_values(path, layers, remarks)
+    labels, moved = on_grid(path, labels, image.placement(), like.shape, like.index_to_patient)
     there = {int(label) for label in _values_in(labels)} - {0}
     gone = [_plain(known[label][0], label) for label in known if label not in there]
     if gone:
@@ -61,14 +135,6 @@ def read_labels(
     kept, said = _names({label: known[label][0] for label in sorted(there)}, names or {}, taken)
     colours = {label: colour for label, (_, colour) in known.items() if colour is not None}
     return LabelMap(labels, kept, colours, (*moved, *remarks, *said))
-
-
-def _read(path: Path, remarks: list[str]) -> tuple[NDArray[np.uint8], _Known, NDArray[np.float64]]:
-    """Labels (i, j, k) on the file's grid, their names and colours, and its placement."""
-    image = open_image(path, layers=True)
-    segments, layers = segments_of(path, image.texts), _layers(path, image)
-    made = _from_segments if segments else _from_values
-    return *made(path, layers, segments, remarks), image.placement()
 
 
 def _layers(path: Path, image: StoredImage) -> NDArray[np.generic]:
@@ -87,7 +153,7 @@ def _layers(path: Path, image: StoredImage) -> NDArray[np.generic]:
 def _from_segments(
     path: Path, layers: NDArray[np.generic], segments: list[Segment], remarks: list[str]
 ) -> tuple[NDArray[np.uint8], _Known]:
-    """Labels (i, j, k), names and colours of segments in their layers."""
+    """Return labels (i, j, k), names and colours of segments in their layers."""
     deepest = max(segment.layer for segment in segments)
     if deepest >= len(layers):
         raise VolumeError(f"{path}: says that a segment is in layer {deepest} of {len(layers)}")
@@ -110,9 +176,9 @@ def _from_segments(
 
 
 def _from_values(
-    path: Path, layers: NDArray[np.generic], _: list[Segment], remarks: list[str]
+    path: Path, layers: NDArray[np.generic], remarks: list[str]
 ) -> tuple[NDArray[np.uint8], _Known]:
-    """Labels (i, j, k) of a file without segments, whose values they are."""
+    """Return labels (i, j, k) of a file without segments, whose values they are."""
     stored = layers[0]
     values = _values_in(stored)
     values = values[values != 0]  # and none is below
@@ -133,32 +199,31 @@ def _from_values(
 
 
 def _values_in(stored: NDArray[np.generic]) -> NDArray[np.generic]:
-    """The values that occur, in order; slab by slab, since sorting takes memory."""
+    """Return the values that occur, in order; slab by slab, since sorting takes memory."""
     return np.asarray(np.unique(np.concatenate([np.unique(slab) for slab in stored])))
 
 
 def _plain(name: str, label: int) -> str:
-    """A name that may be said and kept."""
+    """Return a name that may be said and kept."""
     return readable(name).lower() if is_anatomical(name) else f"structure {label}"
 
 
 def _names(
     found: Mapping[int, str], given: Mapping[int, str], reserved: Collection[str]
 ) -> tuple[dict[int, str], list[str]]:
-    """Names that are kept, each once, and remarks about the others."""
+    """Return names that are kept, each once, and remarks about the others."""
     names: dict[int, str] = {}
     said: list[str] = []
     hidden = [n for n, name in found.items() if n not in given and not is_anatomical(name)]
+    taken = {*reserved, *given.values()}
     for label, name in found.items():
         wanted = given.get(label) or _plain(name, label)
-        taken, number = set(names.values()) | set(given.values()) - {given.get(label)}, 2
-        taken |= set() if label in given else set(reserved)
-        unique = wanted
-        while unique in taken:
-            unique, number = f"{wanted} {number}", number + 1
-        names[label] = unique
-        if wanted in reserved and unique != wanted:
-            said.append(f"{wanted} means something else in a case, so it is called {unique}")
+        numbered = (f"{wanted} {number}" for number in itertools.count(2))
+        free = (each for each in itertools.chain([wanted], numbered) if each not in taken)
+        names[label] = given.get(label) or next(free)
+        taken.add(names[label])
+        if wanted in reserved and names[label] != wanted:
+            said.append(f"{wanted} means something else in a case, so it is called {names[label]}")
     if hidden:
         numbers = ", ".join(map(str, hidden))
         said.append(
@@ -175,7 +240,7 @@ def on_grid(
     shape: tuple[int, int, int],
     wanted: NDArray[np.float64],
 ) -> tuple[NDArray[np.uint8], list[str]]:
-    """The labels on a grid of that shape, and remarks for a person.
+    """Put labels on a grid of that shape, and remark on it for a person.
 
     A file may hold only the part of a volume that is labelled, or its axes in another order or
     direction; its voxels are then those of the volume. Of other grids the nearest voxel is taken.

@@ -85,24 +85,15 @@ def scanning_probe(sweep: Sweep, part: ImagePart, used: NDArray[np.bool_]) -> Sc
         VolumeError: the images are damaged.
     """
     pixel = np.median(np.linalg.norm(sweep.image_to_reference[:, :3, :2], axis=1), axis=0)
-    shape = _named_fan(part, used, pixel) or fitted_part(seen_pixels(sweep), pixel, used)
+    shape: Fan | Rectangle | None = _named_fan(part, used, pixel)
+    if shape is None:
+        picked = _spread(sweep, 32)
+        often = np.sum([image > 0 for image in sweep.images(picked.tolist())], axis=0)
+        # Lossy compression spills grey levels beyond the border, other ones in every frame.
+        shape = fitted_part(often >= 0.7 * len(picked), pixel, used)
     is_known = shape is not None or part.clip is not None
     shape = shape or _rectangle(used, pixel)
     return ScanningProbe(_probe(shape) if is_known else None, _poses(sweep, shape, pixel))
-
-
-def seen_pixels(sweep: Sweep) -> NDArray[np.bool_]:
-    """Tell (rows, columns) whether a pixel is not black in most of 32 frames all over a sweep.
-
-    Raises:
-        VolumeError: the images are damaged.
-    """
-    picked = _spread(sweep, 32)
-    often = np.zeros((sweep.rows, sweep.columns), dtype=np.int32)
-    for image in sweep.images(picked.tolist()):
-        often += image > 0
-    # Lossy compression spills grey levels beyond the border, other ones in every frame.
-    return np.asarray(often >= 0.7 * len(picked))
 
 
 def fitted_part(
@@ -147,7 +138,7 @@ def _named_fan(part: ImagePart, used: NDArray[np.bool_], pixel: NDArray[np.float
 
 
 def _body(seen: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-    """The largest connected part, without its holes; letters and scales beside it are others."""
+    """Return the largest connected part, without its holes; letters beside it are others."""
     around, small = np.pad(seen, 1), np.ones((3, 3))
     smooth = binary_opening(binary_fill_holes(binary_closing(around, small)), small)
     parts, count = connected_parts(smooth[1:-1, 1:-1])
@@ -157,7 +148,7 @@ def _body(seen: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
 
 
 def _rectangle(body: NDArray[np.bool_], pixel: NDArray[np.float64]) -> Rectangle:
-    """The rectangle whose edges are the medians of a part's edges."""
+    """Return the rectangle whose edges are the medians of a part's edges."""
     sides = []
     for lines, side in ((body, pixel[0]), (body.T, pixel[1])):
         lines = lines[lines.any(axis=1)]
@@ -170,7 +161,7 @@ def _rectangle(body: NDArray[np.bool_], pixel: NDArray[np.float64]) -> Rectangle
 def _fan(
     body: NDArray[np.bool_], within: NDArray[np.bool_], pixel: NDArray[np.float64]
 ) -> Fan | None:
-    """The fan on whose edges the border of a part lies, but for where the image cuts it."""
+    """Return the fan on whose edges the border of a part lies, but for where the image cuts it."""
     border = body & ~binary_erosion(body) & binary_erosion(within)
     rows = np.flatnonzero(body.any(axis=1))
     first = body[rows].argmax(axis=1)
@@ -216,7 +207,7 @@ def _fan(
 
 
 def _probe(shape: Fan | Rectangle) -> ProbeSettings | None:
-    """The transducer that scans a shape; None where it is none of the usual ones."""
+    """Return the transducer that scans a shape; None where it is none of the usual ones."""
     values: dict[str, float] = {}
     if isinstance(shape, Rectangle):
         kind, values["aperture"] = "linear", shape.x[1] - shape.x[0]
@@ -240,7 +231,7 @@ def _probe(shape: Fan | Rectangle) -> ProbeSettings | None:
 def _middle_beam(
     shape: Fan | Rectangle,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Where it leaves the face (2,) m, its direction (2,), and its length, m."""
+    """Return where it leaves the face (2,) m, its direction (2,), and its length, m."""
     if isinstance(shape, Rectangle):
         face = np.array([0.5 * sum(shape.x), shape.z[0]])
         return face, np.array([0.0, 1.0]), shape.z[1] - shape.z[0]
@@ -253,15 +244,13 @@ def _middle_beam(
 def _poses(
     sweep: Sweep, shape: Fan | Rectangle, pixel: NDArray[np.float64]
 ) -> tuple[Placement, ...]:
-    """Of the middle of the probe's face at frames all over a sweep."""
+    """Return poses of the middle of the probe's face at frames all over a sweep."""
     face, ahead, _ = _middle_beam(shape)
     poses = []
     for matrix in sweep.image_to_reference[_spread(sweep, 33)]:
         across, down = (matrix[:3, :2] / np.linalg.norm(matrix[:3, :2], axis=0)).T
         z = ahead[0] * across + ahead[1] * down
-        z /= np.linalg.norm(z)
-        x = across - (across @ z) * z
-        x /= np.linalg.norm(x)
+        x = ahead[1] * across - ahead[0] * down
         turned = Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z])).as_quat()
         a, b, c = (round(float(value), 5) for value in matrix[:3] @ [*(face / pixel), 0.0, 1.0])
         i, j, k, w = (round(float(value), 6) for value in turned)
@@ -270,6 +259,6 @@ def _poses(
 
 
 def _spread(sweep: Sweep, most: int) -> NDArray[np.int64]:
-    """Indices of so many frames, evenly over a sweep; of all where there are fewer."""
+    """Return indices of so many frames, evenly over a sweep; of all where there are fewer."""
     count = len(sweep.numbers)
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -20,8 +19,6 @@ from us_sim.volume.sequences.transforms import (
     along,
     shortest_chain,
 )
-
-_LONGEST_GAP = 0.3  # s, between poses that are interpolated; three frames of a slow scanner
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,42 +109,4 @@ def read_sweep(
         left_out,
         chain,
         sequence,
-    )
-
-
-def shifted(sweep: Sweep, offset: float) -> Sweep:
-    """Place each image where the probe was ``offset`` seconds after its time stamp.
-
-    Between two poses the middle of the image moves straight, and all else turns about it; where
-    none is near in time, the image is left out.
-    """
-    from scipy.spatial.transform import Rotation, Slerp  # which takes a tenth of a second
-
-    times, first = np.unique(sweep.times, return_index=True)
-    matrices, wanted = sweep.image_to_reference[first], sweep.times + offset
-    after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
-    used = (times[0] <= wanted) & (wanted <= times[-1])
-    used &= times[after] - times[after - 1] <= _LONGEST_GAP
-    if not used.any():
-        raise VolumeError(
-            f"{sweep.path}: no image has a pose {1e3 * offset:g} ms after its time; give a time "
-            f"offset within the {np.ptp(sweep.times):.2g} s of the sweep"
-        )
-    wanted, base = wanted[used], matrices[0, :3, :3]
-    turns = Slerp(times, Rotation.from_matrix(matrices[:, :3, :3] @ np.linalg.inv(base)))
-    middle = np.array([0.5 * (sweep.columns - 1), 0.5 * (sweep.rows - 1), 0.0])
-    middles = matrices[:, :3, :3] @ middle + matrices[:, :3, 3]
-    moved = np.stack([np.interp(wanted, times, each) for each in middles.T], axis=-1)
-    placed = np.tile(np.eye(4), (len(wanted), 1, 1))
-    placed[:, :3, :3] = turns(wanted).as_matrix() @ base
-    placed[:, :3, 3] = moved - placed[:, :3, :3] @ middle
-    left_out = dict(sweep.left_out)
-    if not used.all():
-        left_out["no pose at its time"] = int((~used).sum())
-    return dataclasses.replace(
-        sweep,
-        numbers=sweep.numbers[used],
-        times=sweep.times[used],
-        image_to_reference=placed,
-        left_out=left_out,
     )

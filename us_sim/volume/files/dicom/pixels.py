@@ -92,12 +92,6 @@ def stored_frames(file: Any, form: ImageFormat, frames: Sequence[int]) -> Iterat
     from pydicom.pixels import iter_pixels
 
     try:
-        if _has_twelve_bit_jpeg(file):
-            import SimpleITK as sitk
-
-            every = sitk.GetArrayFromImage(sitk.ReadImage(str(file.filename)))
-            yield from every.reshape(-1, form.rows, form.columns)[list(frames)]
-            return
         with quiet():
             found = iter_pixels(file, indices=list(frames))
         for _ in frames:
@@ -111,12 +105,6 @@ def stored_frames(file: Any, form: ImageFormat, frames: Sequence[int]) -> Iterat
             f"{file.filename}: its images cannot be decoded ({' '.join(str(error).split())}); copy "
             f"or export it again, or install the decoders: {EXTRA}"
         ) from error
-
-
-def _has_twelve_bit_jpeg(file: Any) -> bool:
-    """Tell whether images are in an encoding that pydicom's decoders read with 8 bits alone."""
-    syntax = str(file.file_meta.TransferSyntaxUID)
-    return syntax == "1.2.840.10008.1.2.4.51" and file.get("BitsStored", 8) > 8
 
 
 def _grey_palette(file: Any) -> tuple[int, NDArray[np.uint8]]:
@@ -202,8 +190,6 @@ class GreyImages:
     @cached_property
     def _scales(self) -> list[list[tuple[float, float]]]:
         """Slope and offset of each image of each file (PS3.3, C.11.1): its own, or the file's."""
-        if _has_twelve_bit_jpeg(self.files[0]):  # whose values SimpleITK has scaled
-            return [[(1.0, 0.0)] * form.frames for form in self.formats]
         key = "PixelValueTransformationSequence"
         return [
             [
