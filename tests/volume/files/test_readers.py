@@ -277,10 +277,10 @@ def test_units_of_nrrd_count(tmp_path, lines, scale):
 def test_a_spacing_that_is_not_stated_is_asked_for_and_one_that_is_stays(tmp_path):
     bare = _nrrd(tmp_path / "a.nrrd", MARKED)
     refused(bare, "--spacing X,Y,Z")
-    there = open_image(bare, spacing=(0.5, 0.25, 2)).placement()
+    there = open_image(bare).placement((0.5, 0.25, 2))
     np.testing.assert_allclose(np.diag(there), [0.5e-3, 0.25e-3, 2e-3, 1])
     with pytest.raises(VolumeError, match="leave out"):
-        open_image(_metaimage(tmp_path / "a.mha"), spacing=(1, 1, 1)).placement()
+        open_image(_metaimage(tmp_path / "a.mha")).placement((1, 1, 1))
 
 
 def test_two_sizes_of_a_nifti_file_are_told_and_the_right_one_can_be_said(shared_file):
@@ -294,7 +294,7 @@ def test_two_sizes_of_a_nifti_file_are_told_and_the_right_one_can_be_said(shared
     ):
         path = shared_file(f"cases/nifti-unit-sform/{name}.nii")
         refused(path, rf"1 × 1 × 1 and {sizes[0]} .*--spacing")
-        there = open_image(path, spacing=sizes).placement()
+        there = open_image(path).placement(sizes)
         np.testing.assert_allclose(np.linalg.norm(there[:3, :3], axis=0) * 1e3, sizes)
 
 

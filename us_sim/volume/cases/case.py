@@ -15,14 +15,13 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import platformdirs
 from numpy.typing import NDArray
 
 from us_sim.errors import CaseError, UsSimError
-from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.reading import Reader
 from us_sim.settings.registry import PROBES
 from us_sim.settings.spelling import aligned, unknown
@@ -46,11 +45,11 @@ class Case:
 
     @property
     def has_labels(self) -> bool:
-        """Whether it is segmented."""
+        """Tell whether it is segmented."""
         return (self.folder / LABELS).is_file()
 
     def placement(self) -> tuple[NDArray[np.float64], tuple[int, int, int]]:
-        """Where its voxels are, from the header alone: (4, 4) m from indices, and the shape.
+        """Read where its voxels are from the header alone: (4, 4) m from indices, and the shape.
 
         Raises:
             VolumeError: the header cannot be used.
@@ -59,7 +58,7 @@ class Case:
         return read_placement(path), open_image(path).shape
 
     def volume(self) -> Volume:
-        """Grey values in the volume's own frame, with labels and their names where it has some.
+        """Read grey values in the volume's own frame, and labels and their names if there are any.
 
         Raises:
             CaseError: the labels are on another grid or are no whole numbers from 0 to 255, one of
@@ -99,25 +98,24 @@ class Case:
                 f"{self.folder / LABELS}: its labels are not 8-bit numbers: use 0 to 255, saved "
                 f"as unsigned char"
             )
-        corners = np.vstack([np.indices((2, 2, 2)).reshape(3, -1), np.ones(8)])
-        corners[:3] *= np.array(shape)[:, None] - 1
-        away = (placement - read_placement(self.folder / LABELS)) @ corners
-        if shape != labels.shape or np.abs(away).max() > 1e-6:
+        # m, by which no voxel is farther off along an axis
+        away = (np.abs(placement - labels.placement()) @ [*shape, 1.0]).max()
+        if shape != labels.shape or away > 1e-6:
             raise CaseError(
                 f"{self.folder / LABELS}: is on another grid than {VOLUME} "
                 f"({' × '.join(map(str, labels.shape))} voxels, {' × '.join(map(str, shape))} "
-                f"there, up to {np.abs(away).max() * 1e3:.3g} mm apart): segment this volume, or "
+                f"there, up to {away * 1e3:.3g} mm apart): segment this volume, or "
                 f"resample the labels"
             )
 
 
 def is_case(folder: str | os.PathLike[str]) -> bool:
-    """Whether a folder has a ``case.yaml``; a link that leads nowhere or in a circle has none."""
+    """Tell whether a folder has a ``case.yaml``; a link that leads nowhere has none."""
     return os.path.isfile(Path(folder) / CASE)
 
 
 def read_case(folder: str | os.PathLike[str]) -> Case:
-    """The case in a folder; its volume is not opened.
+    """Read the case in a folder; its volume is not opened.
 
     Raises:
         CaseError: there is none, or its settings cannot be used.
@@ -137,14 +135,14 @@ def read_case(folder: str | os.PathLike[str]) -> Case:
 
 
 def case_roots() -> list[Path]:
-    """Folders of cases; the first of them goes before the others where a name is in several."""
+    """Return folders of cases; of several that have a name the first is taken."""
     given = os.environ.get("US_SIM_CASES", "")
     roots = [Path(os.path.expanduser(part)) for part in given.split(os.pathsep) if part]
     return roots or [platformdirs.user_data_path("us_sim") / "cases"]
 
 
 def cases_in(root: Path) -> list[Path]:
-    """The folders in a folder that have a ``case.yaml``, by name; itself where it is a case.
+    """Return the folders in a folder that have a ``case.yaml``, by name; itself where it is a case.
 
     Raises:
         CaseError: there is no such folder, or it cannot be read.
@@ -182,11 +180,9 @@ def find_case(name: str | os.PathLike[str], folders: Sequence[Path] = ()) -> Pat
     raise CaseError(f"there is no such case: {unknown(str(name), sorted(named))}")
 
 
-@dataclass(frozen=True)
-class ListedCase:
+class ListedCase(NamedTuple):
     """A line of a list of cases."""
 
-    folder: Path
     name: str
     region: str = ""
     probe: str = ""
@@ -196,42 +192,36 @@ class ListedCase:
 
 
 def listed(folder: Path) -> ListedCase:
-    """The facts of the case in a folder, from its texts and headers alone."""
+    """Collect the facts of the case in a folder, from its texts and headers alone."""
     try:
         case = read_case(folder)
         matrix, shape = case.placement()
         if case.has_labels:
             case.check_grids()
     except UsSimError as error:
-        return ListedCase(folder, folder.name, problem=str(error))
+        return ListedCase(folder.name, problem=str(error))
     voxel = np.linalg.norm(matrix[:3, :3], axis=0) * 1e3
     extent = " × ".join(f"{length:.0f}" for length in voxel * shape)
     sides = sorted({f"{side:.2g}" for side in voxel})
-    settings = case.settings
+    settings, shown = case.settings, ""
+    if settings.probe is not None:
+        array: Any = settings.probe.array.settings(PROBES)
+        shown = f"{settings.probe.geometry}, {array.depth * 1e3:.0f} mm deep"
     return ListedCase(
-        folder,
         folder.name,
         settings.region or settings.name,
-        _probe(settings.probe),
+        shown,
         f"{extent} mm, voxels of {' and '.join(sides)} mm",
         ", ".join(settings.structures) if case.has_labels else "not segmented",
     )
 
 
 def table(cases: Sequence[ListedCase]) -> str:
-    """The cases in columns, and under them the problems of those that cannot be used."""
-    good = [case for case in cases if not case.problem]
+    """Lay out cases in columns, and under them the problems of those that cannot be used."""
+    rows = [case[:-1] for case in cases if not case.problem]
     titles = ("case", "region", "probe", "size", "structures")
-    rows = [titles, *((c.name, c.region, c.probe, c.size, c.structures) for c in good)]
     cut = [[text if len(text) <= 60 else f"{text[:60]}..." for text in row] for row in rows]
-    lines = aligned(cut, left=range(len(titles))) if good else []
+    lines = aligned([titles, *cut], left=range(len(titles))) if rows else []
     return "\n".join(
         [*lines, *(f"cannot be used: {case.problem}" for case in cases if case.problem)]
     )
-
-
-def _probe(probe: ProbeSettings | None) -> str:
-    if probe is None:
-        return ""
-    array: Any = probe.array.settings(PROBES)
-    return f"{probe.geometry}, {array.depth * 1e3:.0f} mm deep"

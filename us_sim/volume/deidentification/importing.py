@@ -64,8 +64,7 @@ class Source:
     placement: NDArray[np.float64] | None  # (4, 4) m, from (column, row, image); None: no volume
     # of echoes, as the header says, with the size of their pixels where it is stated
     regions: Mapping[Rectangle, Scale | None] = field(default_factory=dict)
-    doubt: str = ""  # why it states none, or is not believed
-    needs_part: bool = False  # images that may show a name outside the regions
+    doubt: str = ""  # why it states none, of images that may show a name outside them
     times: Sequence[float] = ()  # s, of images that are no volume
     pixel_mm: Scale | None = None  # of all of an image, where it is stated
 
@@ -208,7 +207,7 @@ def look_at(
             f"--keep-whole-image with it if there is nothing to hide"
         )
     undecided = []
-    if source.needs_part and not (regions or settings.part or settings.keep_whole_image):
+    if source.doubt and not (settings.part or settings.keep_whole_image):
         undecided.append(
             f"names and dates may be burned into its images, and nothing says which part of them "
             f"holds echoes ({source.doubt}); look at it with --picture FILE, then give "
@@ -258,10 +257,10 @@ def _source(paths: list[Path], out: Path | None, settings: ImportSettings) -> So
     if len(paths) == 1 and others:
         if len(spacing) == 2:
             raise VolumeError("--spacing: write three numbers for a volume: X,Y,Z")
-        image = open_image(paths[0], layers=True, spacing=spacing or None)
+        image = open_image(paths[0], layers=True)
         refuse_segments(paths[0], image.texts)
         image.check()
-        placement = image.placement()
+        placement = image.placement(spacing or None)
         voxels, said = grey_voxels(image, settings.volume)
         return Source(image.shape, lambda _: iter(voxels.transpose(2, 1, 0)), said, placement)
     if strange := [*others, *(path for path in paths if not is_dicom(path))]:
@@ -300,8 +299,7 @@ def _of_dicom(
         tuple(conversions),
         placed.placement if placed else None,
         regions,
-        doubt,
-        placed is None or burned,
+        doubt if placed is None or burned else "",
         [n * 0.04 for n in range(len(which))] if times is None else times,
         _stated_scale(first),
     )

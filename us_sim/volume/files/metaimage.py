@@ -71,16 +71,13 @@ def metaimage_numbers(path: Path, fields: Mapping[str, str], header_bytes: int) 
     )
 
 
-def metaimage_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
-    """Describe the image of a header.
-
-    ``given`` is the spacing (3,) in mm of a file that does not state it.
-    """
+def metaimage_image(path: Path) -> StoredImage:
+    """Describe the image of a header."""
     fields, header_bytes = metaimage_header(path)
     numbers = metaimage_numbers(path, fields, header_bytes)
     count = len(fields["DimSize"].split())
 
-    def placement() -> NDArray[np.float64]:
+    def placement(given: ArrayLike | None = None) -> NDArray[np.float64]:
         """(4, 4) m of the first three axes; the matrix has one axis after another."""
         no_turn = " ".join(map(str, np.eye(count).ravel()))
         unit = millimetres(path, fields.get("DistanceUnits", "mm"))

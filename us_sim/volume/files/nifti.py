@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,8 @@ _TO_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])  # NIfTI's x goes to the right, its y 
 _OF_TWO_SIZES = 1e-2  # by which the sizes of voxels may differ that a header states twice
 
 
-def nifti_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
-    """Describe the image of a file, or of a pair of ``.hdr`` and ``.img``, each packed or not.
-
-    ``given`` is the spacing (3,) in mm of a file that does not state it.
-    """
+def nifti_image(path: Path) -> StoredImage:
+    """Describe the image of a file, or of a pair of ``.hdr`` and ``.img``, each packed or not."""
     import nibabel  # which takes half a second
 
     faults = (
@@ -55,10 +53,10 @@ def nifti_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
                 f"{path}: its image data are broken or cut ({error}); copy it again"
             ) from error
 
-    return StoredImage(path, size, kind, 1, lambda: _placement(path, image, given), read)
+    return StoredImage(path, size, kind, 1, partial(_placement, path, image), read)
 
 
-def _placement(path: Path, image: Any, given: ArrayLike | None) -> NDArray[np.float64]:
+def _placement(path: Path, image: Any, given: ArrayLike | None = None) -> NDArray[np.float64]:
     """Place the voxels, (4, 4) m: by the affine matrix, the quaternion, or the spacing alone.
 
     A matrix whose axes are not at right angles gives way to a quaternion, as in ITK.

@@ -6,6 +6,7 @@ import bz2
 import gzip
 import re
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -70,11 +71,8 @@ def nrrd_numbers(path: Path, fields: Mapping[str, Any], start: int) -> StoredNum
     return StoredNumbers(size, number, file, path, start, skip, _UNPACK[encoding])
 
 
-def nrrd_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
-    """Describe an image, whose first axis may be numbers of a voxel and whose last one volumes.
-
-    ``given`` is the spacing (3,) in mm of a file that does not state it.
-    """
+def nrrd_image(path: Path) -> StoredImage:
+    """Describe an image, whose first axis may be numbers of a voxel and whose last one volumes."""
     fields, start = nrrd_header(path)
     numbers = nrrd_numbers(path, fields, start)
     count = len(numbers.size)
@@ -96,7 +94,7 @@ def nrrd_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
         numbers.size,
         numbers.type,
         numbers.size[0] if first else 1,
-        lambda: _placement(path, fields, axes, given),
+        partial(_placement, path, fields, axes),
         numbers.read,
         texts={key: value for key, value in fields.items() if isinstance(value, str)},
         remarks=() if "space" in fields else (remark,),
@@ -113,7 +111,7 @@ def _axes_of_space(fields: Mapping[str, Any], count: int) -> list[int]:
 
 
 def _placement(
-    path: Path, fields: Mapping[str, Any], axes: list[int], given: ArrayLike | None
+    path: Path, fields: Mapping[str, Any], axes: list[int], given: ArrayLike | None = None
 ) -> NDArray[np.float64]:
     """Place the axes of space: (4, 4) m."""
     space = fields.get("space", "lps").lower()

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.files.dicom.header import dicom_files, is_dicom, refuse_other
@@ -69,15 +69,12 @@ def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
     return placed.placement if placed else _placed(path)[1]
 
 
-def open_image(
-    path: Path, *, layers: bool = False, spacing: ArrayLike | None = None
-) -> StoredImage:
+def open_image(path: Path, *, layers: bool = False) -> StoredImage:
     """Describe the image of a MetaImage, NRRD or NIfTI file by its header.
 
     Args:
         path: of the file.
         layers: a voxel may have several numbers, as segmentations of 3D Slicer have.
-        spacing: (3,) mm, of a file that does not state it.
 
     Raises:
         VolumeError: as `read_volume`, except for faults of the voxels and of where they lie.
@@ -91,13 +88,13 @@ def open_image(
     ending = path.name.lower().removesuffix(".gz").rpartition(".")[2]
     if _READERS[ending] is not nifti_image and (use := sequence_use(path)):
         raise VolumeError(f"{path}: is no volume but {use}")
-    image = _READERS[ending](path, spacing)
+    image = _READERS[ending](path)
     image.check(layers=layers)
     return image
 
 
 def is_sequence(kinds: Iterable[str], keys: Iterable[str]) -> bool:
-    """Whether a header is that of a sequence of frames, not of one volume.
+    """Tell whether a header is that of a sequence of frames, not of one volume.
 
     The last kind of an axis says it (``domain domain list``); a list that comes first is the layers
     of a segmentation. Without kinds, transforms of frames or fields of several frames say it: Plus
@@ -140,7 +137,7 @@ def sequence_header(path: Path) -> tuple[dict[str, Any], list[str], list[int], i
 
 
 def _placed(path: Path) -> tuple[StoredImage, NDArray[np.float64]]:
-    """The image of a file with one volume, and its placement."""
+    """Open the image of a file with one volume, and its placement."""
     image = open_image(path)
     if image.volumes > 1:
         raise VolumeError(
@@ -151,7 +148,7 @@ def _placed(path: Path) -> tuple[StoredImage, NDArray[np.float64]]:
 
 
 def _placed_dicom(path: Path) -> PlacedImages | None:
-    """The volume of DICOM files that a path names; None where its name is of another format."""
+    """Open the volume of DICOM files that a path names; None of another format's name."""
     named = path.name.lower().endswith(ENDINGS)
     if not path.is_dir() and (named or not path.is_file() or not is_dicom(path)):
         return None

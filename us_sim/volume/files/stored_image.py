@@ -132,7 +132,8 @@ class StoredImage:
     size: tuple[int, ...]  # along each axis, fastest first, the numbers of a voxel included
     type: np.dtype[Any]  # of a number
     components: int  # numbers of a voxel; where there are several they are the first axis
-    placement: Callable[[], NDArray[np.float64]]  # (4, 4) m, from indices; raises VolumeError
+    # (4, 4) m, from indices, given the spacing (3,) mm of a file that does not state it; raises
+    placement: Callable[..., NDArray[np.float64]]  # VolumeError
     read: Callable[[], NDArray[Any]]  # all numbers, with axes as in `size`; raises VolumeError
     texts: Mapping[str, str] = field(default_factory=dict)  # further keys and values
     remarks: tuple[str, ...] = ()  # on what the header leaves open, a sentence each

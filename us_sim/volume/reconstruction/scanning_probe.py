@@ -250,7 +250,9 @@ def _poses(
     for matrix in sweep.image_to_reference[_spread(sweep, 33)]:
         across, down = (matrix[:3, :2] / np.linalg.norm(matrix[:3, :2], axis=0)).T
         z = ahead[0] * across + ahead[1] * down
-        x = ahead[1] * across - ahead[0] * down
+        z /= np.linalg.norm(z)
+        x = across - (across @ z) * z
+        x /= np.linalg.norm(x)
         turned = Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z])).as_quat()
         a, b, c = (round(float(value), 5) for value in matrix[:3] @ [*(face / pixel), 0.0, 1.0])
         i, j, k, w = (round(float(value), 6) for value in turned)

@@ -19,7 +19,7 @@ Progress = Callable[[float, str], None]
 def segment(
     volume: Volume, settings: SegmentationSettings, progress: Progress = lambda *_: None
 ) -> LabelMap:
-    """The labels of structures, numbered in the order in which the settings name them.
+    """Find the labels of structures, numbered in the order in which the settings name them.
 
     Raises:
         VolumeError: a seed lies outside the volume or where nothing grows from it, or nothing is
@@ -50,9 +50,9 @@ def segment(
 
 
 def _found(volume: Volume, asked: StructureSeeds) -> tuple[NDArray[np.bool_], tuple[slice, ...]]:
-    """Where a structure is, (i, j, k) in a box of the volume, and that box."""
+    """Find where a structure is, (i, j, k) in a box of the volume, and that box."""
     spacing = np.linalg.norm(volume.index_to_patient[:3, :3], axis=0)
-    seeds = np.array(_seeds(volume, asked))
+    seeds = _seeds(volume, asked)
     first, last = np.zeros(3, dtype=int), np.array(volume.shape)
     if asked.reach is not None:
         away = np.ceil(asked.reach / spacing).astype(int) + 1
@@ -94,23 +94,23 @@ def _image(array: NDArray[np.generic], spacing: NDArray[np.float64]) -> sitk.Ima
     return image
 
 
-def _seeds(volume: Volume, asked: StructureSeeds) -> list[tuple[int, int, int]]:
-    """Indices of the voxels that a structure's seeds lie in.
+def _seeds(volume: Volume, asked: StructureSeeds) -> NDArray[np.int64]:
+    """Find the voxels (N, 3) that a structure's seeds lie in.
 
     Raises:
         VolumeError: one is outside the volume.
     """
-    seeds = []
-    for n, point in enumerate(asked.seeds_mm):
-        at = volume.patient_to_index @ [*(1e-3 * np.array(point)), 1.0]
-        i, j, k = (int(n) for n in np.floor(at[:3] + 0.5))
-        if not all(0 <= n < size for n, size in zip((i, j, k), volume.shape, strict=True)):
-            low, high = volume.extent * 1e3
-            spans = ", ".join(f"{a:.0f} to {b:.0f}" for a, b in zip(low, high, strict=True))
-            raise VolumeError(
-                f"seeds_mm[{n}]: {list(point)} mm is outside the volume of "
-                f"{' × '.join(map(str, volume.shape))} voxels, which spans {spans} mm; points of a "
-                f"program that shows right-anterior-superior axes have their first two signs turned"
-            )
-        seeds.append((i, j, k))
+    matrix = volume.patient_to_index
+    points = 1e-3 * np.array(asked.seeds_mm)
+    seeds = np.floor(points @ matrix[:3, :3].T + matrix[:3, 3] + 0.5).astype(np.int64)
+    outside = ((seeds < 0) | (seeds >= volume.shape)).any(axis=1)
+    if outside.any():
+        n = int(outside.argmax())
+        low, high = volume.extent * 1e3
+        spans = ", ".join(f"{a:.0f} to {b:.0f}" for a, b in zip(low, high, strict=True))
+        raise VolumeError(
+            f"seeds_mm[{n}]: {list(asked.seeds_mm[n])} mm is outside the volume of "
+            f"{' × '.join(map(str, volume.shape))} voxels, which spans {spans} mm; points of a "
+            f"program that shows right-anterior-superior axes have their first two signs turned"
+        )
     return seeds

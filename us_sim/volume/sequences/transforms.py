@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from us_sim.volume.files.readers import FRAME_KEY
 
 _LARGEST = 1e7  # mm, of any transform's numbers, so that products of them stay finite
-UNSEEN = "an identity among poses that are none"
 
 
 def split_transform_name(name: str) -> tuple[str, str] | None:
@@ -124,8 +123,8 @@ def frame_time(fields: Mapping[str, str]) -> float:
 def read_transforms(frames: Sequence[Mapping[str, str]]) -> dict[str, FrameTransforms]:
     """Read the transforms of all frames, given the fields of each, by name."""
     keys = sorted({key for fields in frames for key in fields if key.endswith("Transform")})
-    names = [key.removesuffix("Transform") for key in keys]
-    return {name: _over_frames(frames, name) for name in names if split_transform_name(name)}
+    names = filter(split_transform_name, (key.removesuffix("Transform") for key in keys))
+    return {name: _over_frames(frames, name) for name in names}
 
 
 def _over_frames(frames: Sequence[Mapping[str, str]], name: str) -> FrameTransforms:
@@ -141,7 +140,7 @@ def _over_frames(frames: Sequence[Mapping[str, str]], name: str) -> FrameTransfo
         # No measurement is exactly that: Plus fills it in for a body it has not seen.
         matrices[identity] = np.nan
         for k in np.flatnonzero(identity).tolist():
-            faults[k] = UNSEEN
+            faults[k] = "an identity among poses that are none"
     return FrameTransforms(in_metres(name, matrices), tuple(faults))
 
 

@@ -38,7 +38,7 @@ and some edges of the surface would have four triangles. Now they are always joi
 def label_surface(
     volume: Volume, label: int, spacing: float = 0.0, within: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """The closed surface around all voxels of a label, smoothed to hide their stairs.
+    """Make the closed surface around all voxels of a label, smoothed to hide their stairs.
 
     Structures that leave the volume, or the box, end there in a flat cap.
 
@@ -72,19 +72,22 @@ def label_surface(
             f"{_numbered(volume, label)} is too thin for a surface {spacing * 1e3:.2g} mm fine: "
             f"allow more triangles"
         )
-    if field is stairs:
-        vertices, triangles = marching_cubes(field, _STAIRS_LEVEL, gradient_direction="ascent")[:2]
-        return _placed(volume, vertices.astype(np.float64) - pad + start, triangles)
-    wanted = np.count_nonzero(mask) / steps.prod()
-    one, other = (abs(enclosed_volume(*marching_cubes(field, level)[:2])) for level in _LEVELS)
-    level = _LEVELS[0] + (wanted - one) / (other - one) * (_LEVELS[1] - _LEVELS[0])
-    level = float(np.clip(level, 0.2, _LEVELS[0]))
+    level = _STAIRS_LEVEL
+    if field is not stairs:
+        wanted = np.count_nonzero(mask) / steps.prod()
+        one, other = (abs(enclosed_volume(*marching_cubes(field, at)[:2])) for at in _LEVELS)
+        level = _LEVELS[0] + (wanted - one) / (other - one) * (_LEVELS[1] - _LEVELS[0])
+        level = float(np.clip(level, 0.2, _LEVELS[0]))
     vertices, triangles = marching_cubes(field, level, gradient_direction="ascent")[:2]
-    return _placed(volume, vertices.astype(np.float64) * steps - pad + start, triangles)
+    matrix = volume.index_to_patient
+    placed = (vertices.astype(np.float64) * steps - pad + start) @ matrix[:3, :3].T + matrix[:3, 3]
+    if np.linalg.det(matrix[:3, :3]) < 0.0:
+        triangles = triangles[:, ::-1]  # to face outwards in ``patient``, too
+    return placed, np.ascontiguousarray(triangles, dtype=np.int32)
 
 
 def enclosed_volume(vertices: NDArray[np.float64], triangles: NDArray[np.integer]) -> float:
-    """m³ inside a closed surface, by Gauss's theorem; below zero where triangles face inwards.
+    """Return m³ inside a closed surface by Gauss's theorem; below 0 where triangles face inwards.
 
     >>> corners = np.array([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 3]])
     >>> enclosed_volume(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
@@ -122,7 +125,7 @@ def write_stl(path: Path, vertices: NDArray[np.float64], triangles: NDArray[np.i
 def spacing_for(
     volume: Volume, labels: list[int], triangles: int, within: NDArray[np.float64] | None = None
 ) -> float:
-    """m, the spacing at which the surfaces of these labels have about so many triangles together.
+    """Return m, the spacing at which surfaces of labels have about so many triangles together.
 
     Raises:
         VolumeError: as `label_surface`.
@@ -138,7 +141,7 @@ def spacing_for(
 
 
 def occurs(volume: Volume, label: int, within: NDArray[np.float64]) -> bool:
-    """Whether a label has a voxel in a box, (2, 3) m in ``patient``."""
+    """Tell whether a label has a voxel in a box, (2, 3) m in ``patient``."""
     try:
         _voxels_of(volume, label, within)
     except VolumeError:
@@ -151,21 +154,10 @@ def _numbered(volume: Volume, label: int) -> str:
     return f"label {label} ({name})" if name else f"label {label}"
 
 
-def _placed(
-    volume: Volume, indices: NDArray[np.float64], triangles: NDArray[np.integer]
-) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Vertices (V, 3) m of indices, and triangles that face outwards in ``patient``, too."""
-    matrix = volume.index_to_patient[:3, :3]
-    if np.linalg.det(matrix) < 0.0:
-        triangles = triangles[:, ::-1]
-    placed = indices @ matrix.T + volume.index_to_patient[:3, 3]
-    return placed, np.ascontiguousarray(triangles, dtype=np.int32)
-
-
 def _voxels_of(
     volume: Volume, label: int, within: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """A label's mask in the smallest block around it, and that block's first voxel (3,)."""
+    """Return a label's mask in the smallest block around it, and that block's first voxel (3,)."""
     if volume.labels is None:
         raise VolumeError("the volume has no labels, so nothing in it has a surface: segment it")
     block = ndimage.find_objects(volume.labels, max_label=label)[label - 1] if label > 0 else None
