@@ -115,27 +115,17 @@ class LabelMap:
     remarks: tuple[str, ...] = ()  # on how they came about, a sentence each
 
     def __post_init__(self) -> None:
-        names = dict(self.names)
-        for label in np.flatnonzero(self._counts):
-            if label and int(label) not in names:
-                raise VolumeError(f"label {label} has no name: name it")
-        if len(set(names.values())) < len(names):
-            raise VolumeError(f"two structures have the same name, of {', '.join(names.values())}")
-        usual = anatomical_colours(names.values())
-        colours = {n: self.colours.get(n) or usual[name] for n, name in names.items()}
-        object.__setattr__(self, "names", names)
+        usual = anatomical_colours(self.names.values())
+        colours = {n: self.colours.get(n) or usual[name] for n, name in self.names.items()}
         object.__setattr__(self, "colours", colours)
 
     @cached_property
     def voxels(self) -> dict[str, int]:
         """The number of voxels of each structure, by name."""
-        return {name: int(self._counts[label]) for label, name in self.names.items()}
-
-    @cached_property
-    def _counts(self) -> NDArray[np.int64]:
         # A slice at a time, since bincount would make 64-bit numbers of all voxels at once.
-        return np.sum([np.bincount(one.ravel(), minlength=256) for one in self.labels], axis=0)
+        counts = np.sum([np.bincount(one.ravel(), minlength=256) for one in self.labels], axis=0)
+        return {name: int(counts[label]) for label, name in self.names.items()}
 
     def on(self, volume: Volume) -> Volume:
-        """A volume of the same grid with these labels."""
+        """Return a volume of the same grid with these labels."""
         return dataclasses.replace(volume, labels=self.labels, label_names=self.names)

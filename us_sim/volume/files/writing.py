@@ -5,7 +5,6 @@ A file is written beside its place under another name and renamed, so it is whol
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -27,7 +26,7 @@ _LEVEL = 1  # of compression: speckle hardly becomes smaller with any other
 
 
 def write_volume(path: str | os.PathLike[str], volume: Volume) -> None:
-    """The grey values of a volume as an image file; a file of that name is replaced.
+    """Write the grey values of a volume; a file of that name is replaced.
 
     Spacing, origin and direction are those of ``index_to_patient`` in millimetres, on DICOM's
     left-posterior-superior axes. NRRD and MetaImage hold them to 17 digits; NIfTI to 7.
@@ -49,7 +48,7 @@ def write_volume(path: str | os.PathLike[str], volume: Volume) -> None:
 def write_labels(
     path: str | os.PathLike[str], volume: Volume, colours: Mapping[int, Colour] | None = None
 ) -> None:
-    """The labels of a volume as an image file, compressed; a file of that name is replaced.
+    """Write the labels of a volume, compressed; a file of that name is replaced.
 
     NRRD files hold each label's name and colour as segmentations of 3D Slicer do
     (slicer.readthedocs.io, "Segmentation labelmap file format"), which opens one as such where the
@@ -76,7 +75,7 @@ def write_image_sequence(
     times: Sequence[float],
     pixel_mm: tuple[float, float] = (1.0, 1.0),
 ) -> None:
-    """Images and their times as a new sequence file, without poses: a MetaImage as Plus writes it.
+    """Write images and their times, without poses, as a MetaImage sequence of Plus.
 
     Args:
         path: ends in .mha.
@@ -91,8 +90,6 @@ def write_image_sequence(
     if not path.name.lower().endswith(".mha"):
         raise VolumeError(f"{path}: a sequence of images is written as .igs.mha or .mha")
     count, rows, columns = shape
-    assert len(times) == count
-    assert all(map(math.isfinite, times))
     fields = {
         "ObjectType": "Image",
         "NDims": "3",
@@ -119,7 +116,7 @@ def write_image_sequence(
 def _segment_fields(
     labels: NDArray[np.uint8], names: Mapping[int, str], colours: Mapping[int, Colour]
 ) -> dict[str, str]:
-    """The fields by which 3D Slicer knows the segments of a label image (i, j, k)."""
+    """Return the fields by which 3D Slicer knows the segments of a label image (i, j, k)."""
     there = np.flatnonzero(np.bincount(labels.reshape(-1), minlength=256))
     wanted = sorted({*(int(label) for label in there), *names} - {0})
     extent = " ".join(f"0 {count - 1}" for count in labels.shape)
