@@ -40,7 +40,7 @@ def test_a_taken_port_is_said_before_the_volume_is_made(small_scene, taken, monk
     scene, view = load_scene(small_scene), ViewerSettings(port=taken)
     request = Request(scene, view=view)
     with pytest.raises(UsSimError, match=f"port {taken} of 127.0.0.1 is taken: choose another"):
-        live.run(request, network=False, supervision=SupervisionSettings())
+        live.run(request, SupervisionSettings())
 
 
 @pytest.mark.parametrize("view", [ViewerSettings(), None])
@@ -48,9 +48,4 @@ def test_a_taken_port_is_said_before_the_viewer_starts(taken, monkeypatch, view)
     monkeypatch.setattr(live, "follow", fail)
     given = {} if view is None else {"viewer": {"port": str(taken)}}
     with pytest.raises(UsSimError, match="is taken: choose another with --port"):
-        live.view_running(
-            view or ViewerSettings(port=taken),
-            given,
-            network=False,
-            supervision=SupervisionSettings(),
-        )
+        live.view_running(view or ViewerSettings(port=taken), given, SupervisionSettings())

@@ -23,7 +23,7 @@ from us_sim.command.options import (
     viewer,
 )
 from us_sim.errors import UsSimError
-from us_sim.run.processes import begin_fork_server
+from us_sim.run.processes import begin_fork_server, prepare_ros
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.share import find_bag
@@ -53,7 +53,8 @@ def _demo(args: argparse.Namespace) -> int:
     from us_sim.run.live import demo
 
     request = _request(args, "upper_arm", view=viewed(args))
-    return demo(request, args.out, network=args.network, supervision=_supervision(args))
+    prepare_ros(network=args.network)
+    return demo(request, args.out, _supervision(args))
 
 
 def _request(args: argparse.Namespace, default: str | None = None, **more: Any) -> Request:
@@ -98,7 +99,8 @@ def _run(args: argparse.Namespace) -> int:
 
     request = _request(args, record=asked.record, duration=asked.duration, view=viewed(args))
     if not args.dry_run:
-        return run(request, network=args.network, supervision=_supervision(args))
+        prepare_ros(network=args.network)
+        return run(request, _supervision(args))
     scene = request.scene
     checked = check_files(scene)
     path = args.path or (Path(scene.path) if scene.path else None)
@@ -166,7 +168,8 @@ def _view(args: argparse.Namespace) -> int:
                 "--record and --tracker, or leave out --attach"
             )
         parameters = node_parameters(args.param)
-        return view_running(viewer(args), parameters, network=args.network, supervision=supervision)
+        prepare_ros(network=args.network)
+        return view_running(viewer(args), parameters, supervision)
     if args.loop and args.path is None:
         raise UsSimError("--loop plays a path again and again: name one with --path")
     request = _request(
@@ -177,7 +180,8 @@ def _view(args: argparse.Namespace) -> int:
         by_hand=not args.tracker,
         playing={"stay": True, "loop": args.loop} if args.path is not None else {},
     )
-    return run(request, network=args.network, supervision=supervision)
+    prepare_ros(network=args.network)
+    return run(request, supervision)
 
 
 _OF_THE_PLAYER = ("rate", "loop", "time")
@@ -211,11 +215,11 @@ def _play(args: argparse.Namespace) -> int:
     from us_sim.run.live import play
 
     player = read_settings(args, PlayerSettings, (*_OF_THE_PLAYER, "clock"))
+    prepare_ros(network=args.network)
     return play(
         args.bag,
         player,
         topic=args.topic,
         everything=args.everything,
         lockstep=args.lockstep,
-        network=args.network,
     )

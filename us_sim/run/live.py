@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,7 +25,6 @@ from us_sim.run.plan import (
     require_new,
     viewer_process,
 )
-from us_sim.run.processes import prepare_ros
 from us_sim.run.simulation import Simulation
 from us_sim.run.supervision import (
     IMAGER,
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from us_sim.nodes.session_monitor import SessionMonitor
 
 SETTLE_S = 1.2  # after the path's end: for the last images and each node's last report
+_LONG_START_S = 15.0  # longer than a start takes that compiles nothing
 
 
 def follow(
@@ -51,12 +52,12 @@ def follow(
     settings: SupervisionSettings,
     request: Request | None = None,
 ) -> Outcome:
-    """Start the plan's processes and stay with them until they are done; how it went.
+    """Start the plan's processes and stay with them until they are done; return how it went.
 
     Args:
         plan: what runs.
-        log: where what they say goes; None is the terminal.
-        settings: when a node hangs, and how often it is started again.
+        log: as for `Supervisor`, as are the settings.
+        settings: of restarts.
         request: that the plan was made for, which may change while it runs. None where what runs
             is no simulation, of which there is one on a domain.
 
@@ -80,9 +81,6 @@ def follow(
         finally:
             supervisor.end()
         return supervisor.outcome()
-
-
-_LONG_START_S = 15.0  # longer than a start takes that compiles nothing
 
 
 def _await_all(update: Callable[[], None], supervisor: Supervisor) -> None:
@@ -114,9 +112,7 @@ def _stay(update: Callable[[], None], supervisor: Supervisor) -> None:
 
 def _status(plan: Plan, monitor: SessionMonitor) -> str:
     """Return how far what plays is, which images there are, and where the page is."""
-    player = monitor.reports.get(plan.player, {})
-    slicer = monitor.reports.get(IMAGER, {})
-    images = monitor.count(IMAGER, IMAGES)
+    player, slicer, viewer = (monitor.reports.get(n, {}) for n in (plan.player, IMAGER, VIEWER))
     told = []
     if plan.poses is not None and "played" in player:
         told.append(f"{player['played']} of {plan.poses} played")
@@ -124,7 +120,7 @@ def _status(plan: Plan, monitor: SessionMonitor) -> str:
         told.append(f"{player.get('position')} of {player.get('duration')} s played")
     if plan.loops:
         told.append("begins again at its end")
-    if images:
+    if images := monitor.count(IMAGER, IMAGES):
         latency, rate = slicer.get("latency_p99_ms", "?"), slicer.get("rate_hz", "?")
         told.append(f"{images} images, {rate}/s, p99 latency {latency} ms")
     elif slicer.get("received", "0") != "0":
@@ -133,7 +129,7 @@ def _status(plan: Plan, monitor: SessionMonitor) -> str:
         told.append(f"waiting for {player.get('awaited', 'poses')}")
     elif player.get("state") == "waiting":
         told.append(f"waiting for the simulation on ROS domain {domain()}")
-    if port := monitor.reports.get(VIEWER, {}).get("port"):
+    if port := viewer.get("port"):
         host = str(next(each for each in plan.processes if each.node == VIEWER).parameters["host"])
         address = f"http://{f'[{host}]' if ':' in host else host}:{port}/"
         told.append(f"open {address if is_loopback(host) else 'the address with its token, above'}")
@@ -142,12 +138,11 @@ def _status(plan: Plan, monitor: SessionMonitor) -> str:
 
 def dry_run(request: Request) -> str:
     """Return what :func:`run` would start or leave out, and why, one line each."""
-    if request.record is not None:
-        require_new(full_path(request.record))
+    scene, view, path, record = request.scene, request.view, request.path, request.record
+    if record is not None:
+        require_new(full_path(record))
     plan_of(request)
-    scene, view = request.scene, request.view
     rows = [(part.node, part.needed, part.reason) for part in scene.parts()]
-    path, record = request.path, request.record
     source = f"no --path: poses come from `{scene.tracker.source.name}`"
     rows.append(("path_player", path is not None, f"plays {path}" if path else source))
     rows.append((RECORDER, record is not None, f"records to {record}" if record else "no --record"))
@@ -163,13 +158,8 @@ def dry_run(request: Request) -> str:
     )
 
 
-def run(request: Request, *, network: bool, supervision: SupervisionSettings) -> int:
+def run(request: Request, supervision: SupervisionSettings) -> int:
     """Run a scene until its path ends, the duration is over, or Ctrl-C.
-
-    Args:
-        request: the scene, and what is recorded, played and shown.
-        network: talk beyond this host.
-        supervision: when a node hangs, and how often it is started again.
 
     Raises:
         UsSimError: bad input, or something was lost: a node ended or hung, images were not
@@ -179,7 +169,6 @@ def run(request: Request, *, network: bool, supervision: SupervisionSettings) ->
         raise UsSimError(f"--topic {request.topic}: is of a path: name its file with --path")
     if request.record is not None:
         require_new(full_path(request.record))
-    prepare_ros(network=network)
     outcome = _simulate(request, None, supervision)
     for file in outcome.files:
         print(f"recorded to {file}")
@@ -195,20 +184,12 @@ def _simulate(request: Request, log: Path | None, supervision: SupervisionSettin
     return follow(plan, log, supervision, request)
 
 
-def demo(request: Request, out: Path, *, network: bool, supervision: SupervisionSettings) -> int:
+def demo(request: Request, out: Path, supervision: SupervisionSettings) -> int:
     """Replay a path through a scene's nodes; recording, contact sheet and summary in ``out``.
 
-    Args:
-        request: the scene, and what is played and shown.
-        out: folder to write to.
-        network: talk beyond this host.
-        supervision: when a node hangs, and how often it is started again.
-
     Raises:
-        UsSimError: bad input, ``out`` already holds a session, or something was lost: a node ended
-            or hung, images were not recorded.
+        UsSimError: as for `run`, or ``out`` already holds a session.
     """
-    prepare_ros(network=network)
     if ros_arguments():
         raise UsSimError(
             "--ros-args: the demo's report is of topics under their usual names: use `us-sim run "
@@ -228,15 +209,12 @@ def demo(request: Request, out: Path, *, network: bool, supervision: Supervision
     return _require_nothing_lost(outcome)
 
 
-def view_running(
-    view: ViewerSettings, given: Parameters, *, network: bool, supervision: SupervisionSettings
-) -> int:
+def view_running(view: ViewerSettings, given: Parameters, supervision: SupervisionSettings) -> int:
     """Show whatever runs on this ROS domain, here or on other machines, until Ctrl-C.
 
     Raises:
         UsSimError: the viewer cannot start, or one is there already.
     """
-    prepare_ros(network=network)
     viewer = viewer_process(view, checked_parameters("viewer", None, given.get("viewer", {})))
     others = sorted(set(given) - {viewer.node})
     if others:
@@ -249,15 +227,7 @@ def view_running(
     return _require_nothing_lost(follow(plan, None, supervision))
 
 
-def play(
-    bag: Path,
-    player: PlayerSettings,
-    *,
-    topic: str,
-    everything: bool,
-    lockstep: bool,
-    network: bool,
-) -> int:
+def play(bag: Path, player: PlayerSettings, *, topic: str, everything: bool, lockstep: bool) -> int:
     """Play a bag into whatever runs on this ROS domain.
 
     Raises:
@@ -266,11 +236,8 @@ def play(
     from us_sim.recording.path import read_path
     from us_sim.recording.reader import read_bag
 
-    prepare_ros(network=network)
-    settings: dict[str, object] = {
-        "path": str(full_path(bag)),
-        **{name: value for name, value in vars(player).items() if value is not None},
-    }
+    given = {name: value for name, value in vars(player).items() if value is not None}
+    settings: dict[str, object] = {"path": str(full_path(bag)), **given}
     if everything:
         process, poses = NodeProcess("session_player", settings), read_bag(bag).message_count
     else:
@@ -288,7 +255,7 @@ def _require_nothing_lost(outcome: Outcome) -> int:
 
 def _report(scene: Scene, out: Path, outcome: Outcome, wall: float) -> None:
     from us_sim.run.contact_sheet import contact_sheet
-    from us_sim.run.session_summary import read_session, write_summary
+    from us_sim.run.session_summary import read_session
 
     with Progress("measuring the recording", 100, "%") as bar:
         session = read_session(*outcome.files)
@@ -299,7 +266,7 @@ def _report(scene: Scene, out: Path, outcome: Outcome, wall: float) -> None:
         bar.update(50, "drawing the contact sheet")
         contact_sheet(session, scene, areas, out / "contact_sheet.png")
         bar.update(100)
-    write_summary(summary, out / "summary.json")
+    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     latency = summary["latency_ms"]
     image, recorder = latency["/ultrasound/image"], latency["end_to_end"]
     print(

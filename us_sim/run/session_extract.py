@@ -24,14 +24,18 @@ from us_sim.run.session_tables import (
     bodies_of,
     read_times,
     read_values,
+    topics_of,
     write_table,
 )
 from us_sim.settings.spelling import counted
 
-_KINDS = (("", "m"), ("f", "n"), ("t", "nm"))  # of numbers: position, force, torque
 _HELD = {"poses": "poses", "wrench": "wrench", "images": "image", "areas": "scene attached"}
 AREAS = 200  # images of which areas are measured, evenly over the session
-_UNITS = {f"{kind}{axis}": f"{kind}{axis}_{unit}" for kind, unit in _KINDS for axis in "xyz"}
+_UNITS = {
+    f"{kind}{axis}": f"{kind}{axis}_{unit}"
+    for kind, unit in (("", "m"), ("f", "n"), ("t", "nm"))  # position, force, torque
+    for axis in "xyz"
+}
 """Names of columns with their units."""
 
 
@@ -44,17 +48,16 @@ def write_parts(
         bag: the recording.
         folder: gets the files.
         parts: some of ``poses``, ``wrench``, ``images`` and ``areas``.
-        progress: takes the fraction done, and what is being done.
+        progress: is called meanwhile.
 
     Raises:
         BagError: the bag lacks a part, a file exists, or cannot be written.
         UsSimError: the scene for the areas cannot be read.
     """
-    there = [topic for topic in bag.topics if topic.message_count]
     needed = {
         "poses": bodies_of(bag),
-        "wrench": [topic.name for topic in there if topic.type_name == WRENCH_STAMPED],
-        "images": [topic.name for topic in there if topic.type_name in PIXELS],
+        "wrench": topics_of(bag, WRENCH_STAMPED),
+        "images": topics_of(bag, *PIXELS),
         "areas": [name for name in bag.attachments([]) if name == "scene.yaml"],
     }
     if lacking := [part for part in parts if not needed[part]]:
@@ -62,7 +65,11 @@ def write_parts(
         leave = " and ".join(f"--{part}" for part in lacking)
         raise BagError(f"{bag.path} holds {missing}; leave out {leave}")
     for name in [name for part in ("poses", "wrench") if part in parts for name in needed[part]]:
-        yield _write_values(bag, name, folder)
+        times, values = read_values(bag, name)
+        stamps, logged = times["stamp"].map(_seconds), times["logged"].map(_seconds)
+        head = pd.DataFrame({"stamp_s": stamps, "recorded_s": logged, "frame": times["frame"]})
+        table = head.join(values.rename(columns=_UNITS))
+        yield write_table(folder / f"{_file_name(name)}.csv", table, na_rep="nan")
     if "images" in parts:
         made = [
             each for name in needed["images"] for each in _write_images(bag, name, folder, progress)
@@ -72,15 +79,6 @@ def write_parts(
             raise BagError(f"{bag.path} holds no image that can be decoded")
     if "areas" in parts:
         yield _write_areas(bag, folder, progress)
-
-
-def _write_values(bag: Bag, name: str, folder: Path) -> Path:
-    """Write poses or wrenches as CSV."""
-    times, values = read_values(bag, name)
-    stamps, logged = times["stamp"].map(_seconds), times["logged"].map(_seconds)
-    head = pd.DataFrame({"stamp_s": stamps, "recorded_s": logged, "frame": times["frame"]})
-    table = head.join(values.rename(columns=_UNITS))
-    return write_table(folder / f"{_file_name(name)}.csv", table, na_rep="nan")
 
 
 def _write_images(bag: Bag, name: str, folder: Path, progress: Progress) -> Iterator[Path | str]:
@@ -117,7 +115,7 @@ def _write_images(bag: Bag, name: str, folder: Path, progress: Progress) -> Iter
 
 
 def _write_areas(bag: Bag, folder: Path, progress: Progress) -> Path:
-    """Areas of vessels in the image plane, now and in the same plane of the tissue at rest."""
+    """Write areas of vessels in the image plane, now and in the same plane of tissue at rest."""
     with scene_of(bag) as scene:
         session = read_session(bag.path)
         areas = session.lumen_areas(scene, AREAS, lambda done: progress(done, "areas"))
@@ -144,7 +142,7 @@ def _seconds(nanoseconds: int) -> str:
 
 
 def _spacing(bag: Bag, name: str) -> list[float]:
-    """m from column to column and from row to row, where the recording says so."""
+    """Find the m from column to column and from row to row, where the recording says so."""
     matrices = f"{name.rpartition('/')[0]}/image_to_probe"
     if any(each.name == matrices for each in bag.topics):
         for message in bag.messages([matrices]):

@@ -35,6 +35,7 @@ from us_sim.run.session_tables import (
     bodies_of,
     read_times,
     read_values,
+    topics_of,
 )
 from us_sim.settings.spelling import counted
 from us_sim.tracking.camera.encodings import decode_image, decompress_image
@@ -68,9 +69,8 @@ def to_lerobot(
         sessions: bags of any kind.
         folder: to make.
         task: in words.
-        progress: takes the fraction done, and what is being done.
-        rate: frames a second; by default that of the first session's images, or else of the
-            fastest topic.
+        progress: is called meanwhile.
+        rate: frames a second; None is the `usual_rate` of the first session.
         is_video: code images as video, which loses speckle.
         wanted: their parts, as for `Episode`.
 
@@ -83,21 +83,20 @@ def to_lerobot(
         raise BagError(f"--rate: {rate} is outside 1 to {_HIGHEST_RATE} frames a second")
     hertz = rate or Episode(read_bag(sessions[0]), **wanted).usual_rate
     told: list[str] = []
-    count = 0
+    counts: list[int] = []
 
     def episodes() -> Iterator[LeRobotEpisode]:
-        nonlocal count
         for session in sessions:
             episode = Episode(read_bag(session), **wanted)
             moments = episode.moments(hertz)
             frames = episode.frames(moments, progress)
             yield LeRobotEpisode(frames, episode.names, task, str(session))
-            count += len(moments)
+            counts.append(len(moments))
             told.extend(f"{session.name}: {sentence}" for sentence in episode.told(moments))
 
     write_episodes(folder, hertz, episodes(), is_video=is_video)
     progress(1.0, "")
-    return [*told, f"{counted(count, 'frame')} at {hertz} Hz in {folder}"]
+    return [*told, f"{counted(sum(counts), 'frame')} at {hertz} Hz in {folder}"]
 
 
 @dataclass
@@ -117,14 +116,8 @@ class Track:
             raise BagError(f"has {messages} of use, and two are needed")
         self.times: Times = self.table.index.to_numpy()
 
-    @property
-    def span(self) -> tuple[int, int]:
-        """First and last time of which all is known, ns."""
-        columns = [self.table[name].dropna().index for name in self.table]
-        return max(int(each[0]) for each in columns), min(int(each[-1]) for each in columns)
-
     def values(self, moments: Times) -> NDArray[np.float32]:
-        """(M, N) numbers, each between the nearest that there are.
+        """Interpolate (M, N) numbers, each between the nearest that there are.
 
         From one moment to the next a quaternion does not change its sign without need; the first
         has w of 0 or more.
@@ -143,11 +136,11 @@ class Track:
         return made
 
     def latest(self, moments: Times) -> NDArray[np.int64]:
-        """(M,) row of the last message at or before each moment."""
+        """Find the row (M,) of the last message at or before each moment."""
         return np.searchsorted(self.times, moments, side="right") - 1
 
     def images(self, bag: Bag, moments: Times) -> Iterator[NDArray[np.uint8]]:
-        """The latest image of each moment; for one that is damaged the one before."""
+        """Read the latest image of each moment; for one that is damaged the one before."""
         place, pixels = -1, None
         messages = enumerate(bag.messages([self.name]))
         for wanted in self.table["place"].to_numpy()[self.latest(moments)]:
@@ -163,7 +156,7 @@ class Track:
             yield pixels
 
     def told(self, moments: Times) -> str:
-        """What became of its messages, in numbers."""
+        """Say what became of its messages, in numbers."""
         if self.is_image:
             shown = self.latest(moments)
             count = len(np.unique(shown))
@@ -208,9 +201,10 @@ class Episode:
         self._actions = [whole_name(bag, action)] if action else []
         named = [whole_name(bag, name) for name in topics] + self._actions
         self._tracks: list[Track] = []
-        for name in dict.fromkeys([*(named if topics else _known(bag)), *self._actions]):
+        all_known = [*topics_of(bag, *PIXELS, *VALUES), *bodies_of(bag), *self._actions]
+        for name in dict.fromkeys(named if topics else all_known):
             try:
-                self._tracks.append(self._track(name))
+                self._tracks.append(self._read_track(name))
             except (BagError, TrackingError) as error:
                 if name in named:
                     raise BagError(f"{bag.path}: {name}: {error}") from error
@@ -221,17 +215,15 @@ class Episode:
                 f"used; {'; '.join(self._left_out) or 'it has other topics alone'}"
             )
         self._tracks.sort(key=lambda track: not track.is_image)
-        numbers = [track for track in self._tracks if not track.is_image]
-        self._numbers = {
-            STATE: [track for track in numbers if track.name not in self._actions],
-            "action": [track for track in numbers if track.name in self._actions],
-        }
+        self._images = [track for track in self._tracks if track.is_image]
+        self._numbers: dict[str, list[Track]] = {STATE: [], "action": []}
+        for track in self._tracks[len(self._images) :]:
+            self._numbers["action" if track.name in self._actions else STATE].append(track)
 
     @property
     def usual_rate(self) -> int:
         """Frames a second: of the images, or else of what is fastest."""
-        images = [track for track in self._tracks if track.is_image]
-        steps = [np.median(np.diff(each.times)) for each in images or self._tracks]
+        steps = [np.median(np.diff(each.times)) for each in self._images or self._tracks]
         return int(np.clip(round(SECOND / min(steps)), 1, _HIGHEST_RATE))
 
     @property
@@ -243,27 +235,32 @@ class Episode:
         }
 
     def moments(self, rate: int) -> Times:
-        """Times of frames, ns: from when all topics have begun until one of them ends.
+        """Choose times of frames, ns: from when all topics have begun until one of them ends.
 
         Raises:
             BagError: they are never there at once, or for absurdly long.
         """
-        spans = pd.DataFrame([each.span for each in self._tracks], columns=["begin", "end"])
-        begin, end, first = spans["begin"].max(), spans["end"].min(), spans["begin"].min()
-        count = int(end - begin) * rate // SECOND + 1
+        begins, ends = [], []
+        for each in self._tracks:  # as long as all of its numbers are known
+            known = [each.table[name].dropna().index for name in each.table]
+            begins.append(max(int(times[0]) for times in known))
+            ends.append(min(int(times[-1]) for times in known))
+        begin, end = max(begins), min(ends)
+        count = (end - begin) * rate // SECOND + 1
         if end <= begin or count > _MOST_FRAMES:
             told = ", ".join(
-                f"{track.name} from {(a - first) / SECOND:.3f} to {(b - first) / SECOND:.3f} s"
-                for track, a, b in zip(self._tracks, spans["begin"], spans["end"], strict=True)
+                f"{track.name} from {(a - min(begins)) / SECOND:.3f} to "
+                f"{(b - min(begins)) / SECOND:.3f} s"
+                for track, a, b in zip(self._tracks, begins, ends, strict=True)
             )
             raise BagError(
                 f"{self._bag.path}: by their stamps there is {told}: name those that go together "
                 f"with --topics, or give --by-log-time where clocks differ"
             )
-        return int(begin) + np.arange(count) * SECOND // rate
+        return begin + np.arange(count) * SECOND // rate
 
     def frames(self, moments: Times, progress: Progress = lambda *_: None) -> Iterator[Frame]:
-        """The features of each moment."""
+        """Make the features of each moment."""
         rows = {
             feature: np.hstack([each.values(moments) for each in tracks])
             for feature, tracks in self._numbers.items()
@@ -271,8 +268,7 @@ class Episode:
         }
         images = {  # lerobot allows no slash in a feature's name
             f"{IMAGES}{each.name.strip('/').replace('/', '_')}": each.images(self._bag, moments)
-            for each in self._tracks
-            if each.is_image
+            for each in self._images
         }
         for k in range(len(moments)):
             progress(k / len(moments), self._bag.path.name)
@@ -281,31 +277,31 @@ class Episode:
             }
 
     def told(self, moments: Times) -> Iterator[str]:
-        """Sentences on what became of its messages, after the frames were taken."""
+        """Say what became of its messages, after the frames were taken."""
         yield counted(len(moments), "frame")
         yield from self._left_out
         yield from (each.told(moments) for each in self._tracks)
 
-    def _track(self, name: str) -> Track:
+    def _read_track(self, name: str) -> Track:
         topic = self._bag.topic(name.partition(":")[0])
         if topic.type_name not in PIXELS:
-            return self._track_of_numbers(name, turns=topic.type_name not in VALUES)
+            return self._read_numbers(name, turns=topic.type_name not in VALUES)
         if name in self._actions:
             raise BagError("is a topic of images, which are no action")
         for raw in self._bag.messages([name]):  # refused at once where it cannot be decoded
             PIXELS[topic.type_name](self._bag.deserialize(raw), "RGB")
             break
-        times, notes = self._times(read_times(self._bag, [name])[name])
+        times, notes = self._judge_times(read_times(self._bag, [name])[name])
         is_shown = times > times.cummax().shift(fill_value=-1)  # else it came too late
         table = pd.DataFrame({"place": times.index[is_shown]}, index=times[is_shown])
         return Track(name, table, notes, is_image=True)
 
-    def _track_of_numbers(self, name: str, *, turns: bool) -> Track:
+    def _read_numbers(self, name: str, *, turns: bool) -> Track:
         found, table = read_values(self._bag, name)
         frames = found["frame"].unique()
         if turns and len(frames) > 1:
             raise BagError(f"has poses in the frames {', '.join(frames)}, and a path has one")
-        times, notes = self._times(found)
+        times, notes = self._judge_times(found)
         there = pd.DataFrame(np.isfinite(table))
         if turns and len(table):
             there = there.mul(is_pose(table.to_numpy()), axis=0)
@@ -319,8 +315,8 @@ class Episode:
         table = table.groupby(level=0).first().dropna(how="all").dropna(axis=1, how="all")
         return Track(name, table, notes, turns=turns)
 
-    def _times(self, table: pd.DataFrame) -> tuple[pd.Series, list[str]]:
-        """The time of each message, ns: its stamp, or when it was recorded; and what is odd.
+    def _judge_times(self, table: pd.DataFrame) -> tuple[pd.Series, list[str]]:
+        """Give each message its time, ns: its stamp, or when it was recorded; and say what is odd.
 
         Raises:
             BagError: one is of another time, as after a clock was set back.
@@ -342,10 +338,3 @@ class Episode:
             are = counted(count, "message is", "messages are")
             notes.append(f"{are} stamped before one that was recorded earlier")
         return times, notes
-
-
-def _known(bag: Bag) -> list[str]:
-    """Topics with messages of a type that is known; bodies of others without a PoseStamped."""
-    there = [topic for topic in bag.topics if topic.message_count]
-    known = [topic.name for topic in there if topic.type_name in (*PIXELS, *VALUES)]
-    return [*known, *bodies_of(bag)]

@@ -13,7 +13,7 @@ from us_sim.recording.path import POSE_STAMPED, ProbePath, is_tracker_recording,
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.run.session_scene import scene_of
 from us_sim.run.session_summary import POSE, read_session
-from us_sim.run.session_tables import SECOND, WRENCH_STAMPED, Progress, read_wrenches
+from us_sim.run.session_tables import SECOND, WRENCH_STAMPED, Progress, read_wrenches, topics_of
 from us_sim.scene.building import probe_of, volume_of
 from us_sim.scoring.lumen import vessels_in
 from us_sim.scoring.metrics import Force, Scan
@@ -38,7 +38,7 @@ def read_scan(
         file: the recording.
         topic: of the poses, as for `read_path`.
         wrench: topic of the force; by default ``probe/wrench``, or the only one of its type.
-        progress: takes the fraction done, and what is being done.
+        progress: is called meanwhile.
 
     Raises:
         BagError: there are no poses, or what was named is not there.
@@ -60,7 +60,7 @@ def read_scan(
         return Scan(motion, missing=(*missing, f"force and areas: {file} holds poses alone"))
     force, frozen, truth = None, None, {}
     try:
-        force = _force(bag, wrench, begin)
+        force = _read_force(bag, wrench, begin)
     except ScoreError as error:
         missing.append(f"force: {error}")
     if f"/{MARKERS}" in types:
@@ -69,7 +69,7 @@ def read_scan(
     else:
         missing.append(f"images that were frozen: {file} has no marks on /{MARKERS}")
     try:
-        truth = _truth(bag, path, progress)
+        truth = _measure_vessels(bag, path, progress)
     except UsSimError as error:
         missing.append(f"areas of structures: {error}")
     sections = truth.get("sections", {})
@@ -78,7 +78,7 @@ def read_scan(
     return Scan(motion, force, frozen=frozen, missing=tuple(missing), **truth)
 
 
-def _force(bag: Bag, topic: str | None, begin: int) -> Force:
+def _read_force(bag: Bag, topic: str | None, begin: int) -> Force:
     """Read the force on the probe.
 
     Raises:
@@ -86,8 +86,7 @@ def _force(bag: Bag, topic: str | None, begin: int) -> Force:
         ScoreError: none was named, and there is none, or several, or no wrench that can be used.
     """
     if topic is None:
-        wrenches = [each for each in bag.topics if each.type_name == WRENCH_STAMPED]
-        names = [each.name for each in wrenches if each.message_count]
+        names = topics_of(bag, WRENCH_STAMPED)
         names = [name for name in names if name.endswith("probe/wrench")] or names
         if len(names) != 1:
             several = f"wrenches on {', '.join(names)}: name one with --wrench"
@@ -101,8 +100,8 @@ def _force(bag: Bag, topic: str | None, begin: int) -> Force:
     return Force(((stamps[usable] - begin) / SECOND).to_numpy(), newtons[usable])
 
 
-def _truth(bag: Bag, path: ProbePath, progress: Progress) -> dict[str, Any]:
-    """Sections, lines and thrombi of the vessels; of five images a second, and two hundred in all.
+def _measure_vessels(bag: Bag, path: ProbePath, progress: Progress) -> dict[str, Any]:
+    """Measure sections, lines and thrombi of the vessels, at five images a second, 200 in all.
 
     Raises:
         UsSimError: there is no scene or image, or a file of the scene is missing or another.

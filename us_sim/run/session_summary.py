@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -184,8 +183,3 @@ def read_session(file: Path, *further: Path) -> Session:
         times,
         reports,
     )
-
-
-def write_summary(summary: dict[str, Any], file: Path) -> None:
-    """The summary as indented JSON."""
-    file.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")

@@ -28,6 +28,7 @@ WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
 _LARGEST = 2**63 - 1
 _COLUMNS = ("stamp", "logged", "sent", "number", "size", "is_short")
 Progress = Callable[[float, str], None]
+"""Takes the fraction done, and what is being done."""
 
 
 def read_times(
@@ -44,7 +45,7 @@ def read_times(
         bag: the recording.
         topics: names of topics; None for all.
         faults: takes what is wrong with the bag, all of which is read then.
-        progress: takes the fraction done, and the topic.
+        progress: is called meanwhile.
 
     Raises:
         BagError: the bag is damaged, and ``faults`` is None; or it has no such topic.
@@ -72,11 +73,15 @@ def read_times(
     }
 
 
+def topics_of(bag: Bag, *types: str) -> list[str]:
+    """List the topics of some types that have messages."""
+    return [each.name for each in bag.topics if each.message_count and each.type_name in types]
+
+
 def bodies_of(bag: Bag) -> list[str]:
-    """Names of topics of PoseStamped with messages, or else of every body of other types."""
-    there = [topic for topic in bag.topics if topic.message_count]
-    stamped = [topic.name for topic in there if topic.type_name == POSE_STAMPED]
-    return stamped or [name for names in bodies_in(bag).values() for name in names]
+    """List the topics of PoseStamped with messages, or else every body of other types."""
+    bodies = [name for names in bodies_in(bag).values() for name in names]
+    return topics_of(bag, POSE_STAMPED) or bodies
 
 
 def _numbers(names: tuple[str, ...], linear: Any, angular: Any) -> dict[str, float]:
@@ -84,15 +89,14 @@ def _numbers(names: tuple[str, ...], linear: Any, angular: Any) -> dict[str, flo
     return dict(zip(names, map(float, values), strict=True))
 
 
-_VALUES: Mapping[str, Callable[[Any], dict[str, float]]] = {
+VALUES: Mapping[str, Callable[[Any], dict[str, float]]] = {
     WRENCH_STAMPED: lambda m: _numbers(WRENCH_PARTS, m.wrench.force, m.wrench.torque),
     "geometry_msgs/msg/TwistStamped": lambda m: _numbers(
         ("x", "y", "z", "rx", "ry", "rz"), m.twist.linear, m.twist.angular
     ),
     "sensor_msgs/msg/JointState": lambda m: dict(zip(m.name, m.position.tolist(), strict=False)),
 }
-VALUES = tuple(_VALUES)
-"""Types whose numbers `read_values` reads, besides those of poses."""
+"""The numbers in messages of these types, which are no poses."""
 
 
 def read_values(bag: Bag, name: str) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -113,13 +117,13 @@ def read_values(bag: Bag, name: str) -> tuple[pd.DataFrame, pd.DataFrame]:
     topic = bag.topic(name.partition(":")[0])
     rows: list[tuple[int, int, str]] = []
     numbers: list[dict[str, float]] = []
-    if topic.type_name in _VALUES:
+    if topic.type_name in VALUES:
         for raw in bag.messages([topic.name]):
             message = bag.deserialize(raw)
             try:
                 stamp = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
                 rows.append((stamp, raw.log_time, message.header.frame_id))
-                numbers.append(_VALUES[topic.type_name](message))
+                numbers.append(VALUES[topic.type_name](message))
             except (AttributeError, TypeError, ValueError) as error:
                 kind = f"no {topic.type_name} of ROS 2"
                 raise BagError(f"{bag.path}, {topic.name}: {kind}: {error}") from None
