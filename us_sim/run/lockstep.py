@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import importlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from us_sim.errors import UsSimError
 from us_sim.progress import Progress
 from us_sim.run.domain import ros_context
-from us_sim.run.plan import NodeProcess, Plan, Request, plan_of, prepare_scene
+from us_sim.run.plan import NodeProcess, Request, plan_of, prepare_scene
 from us_sim.run.processes import prepare_ros
 from us_sim.scene.building import volume_of
 from us_sim.scene.scene import Scene
@@ -47,9 +47,15 @@ def render(request: Request, out: Path, *, truth: bool = False) -> int:
     out.mkdir(parents=True, exist_ok=True)
     plan = plan_of(request)
     prepare_scene(request.scene, request.path, plan.topic)
-    folders = truth_folders(request.scene, out) if truth else {}
+    folders = _make_truth_folders(request.scene, out) if truth else {}
+    recorder, *nodes = plan.processes
+    written = {"folder": out / "images", **folders}
+    processes = [  # listeners first, the player last
+        replace(recorder, parameters=_RECORDED | recorder.parameters),
+        NodeProcess("image_writer", {what: str(folder) for what, folder in written.items()}),
+        *(replace(node, parameters={"lockstep": True} | node.parameters) for node in nodes),
+    ]
     with Progress("rendering", plan.poses, "images") as bar:
-        processes = _in_lockstep(plan, {"folder": out / "images", **folders})
         count = _run(processes, bar.update, [*folders])
     print(f"{counted(count, 'image')} in {out / 'images'}, all messages in {request.record}")
     for what, folder in folders.items():
@@ -57,7 +63,7 @@ def render(request: Request, out: Path, *, truth: bool = False) -> int:
     return 0
 
 
-def truth_folders(scene: Scene, out: Path) -> dict[str, Path]:
+def _make_truth_folders(scene: Scene, out: Path) -> dict[str, Path]:
     """Return folders in ``out`` for all that can be known of the scene's images.
 
     Beside the labels goes a table of what their numbers mean, ``labels.csv``.
@@ -82,16 +88,6 @@ def truth_folders(scene: Scene, out: Path) -> dict[str, Path]:
     return folders
 
 
-def _in_lockstep(plan: Plan, folders: Mapping[str, Path]) -> list[NodeProcess]:
-    """Return the nodes and their parameters: listeners first, the player last."""
-    recorder, *nodes = plan.processes
-    return [
-        replace(recorder, parameters=_RECORDED | recorder.parameters),
-        NodeProcess("image_writer", {what: str(folder) for what, folder in folders.items()}),
-        *(replace(node, parameters={"lockstep": True} | node.parameters) for node in nodes),
-    ]
-
-
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def _run(processes: list[NodeProcess], progress: Callable[[int], None], truth: list[str]) -> int:
     """Run nodes in this process until all poses are played; return the number of images.
@@ -105,7 +101,7 @@ def _run(processes: list[NodeProcess], progress: Callable[[int], None], truth: l
     nodes: list[Any] = []
     try:
         for process in processes:
-            nodes.append(_node(process, context))
+            nodes.append(_make_node(process, context))
             executor.add_node(nodes[-1])
         return _spin(executor, nodes, progress, truth)
     finally:
@@ -116,7 +112,7 @@ def _run(processes: list[NodeProcess], progress: Callable[[int], None], truth: l
         context.try_shutdown()
 
 
-def _node(process: NodeProcess, context: Any) -> Any:
+def _make_node(process: NodeProcess, context: Any) -> Any:
     """Make a node in this process.
 
     Raises:

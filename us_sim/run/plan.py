@@ -5,7 +5,6 @@ A `Request` says what a person wants; `plan_of` makes a `Plan` of processes from
 
 from __future__ import annotations
 
-import functools
 import json
 import os
 import posixpath
@@ -81,7 +80,7 @@ class Request:
         return replace(self, path=Path(self.scene.path))
 
     def with_scene(self, scene: Scene) -> Request:
-        """Another scene, in which nothing is recorded or played yet.
+        """Return a request of another scene, in which nothing is recorded or played yet.
 
         Parameters of the scene's nodes were given for the scene before.
         """
@@ -90,7 +89,7 @@ class Request:
         return replace(self.without_replay(), scene=scene, parameters=kept, record=None)
 
     def without_replay(self) -> Request:
-        """The same with nothing played."""
+        """Return the same with nothing played."""
         return replace(self, path=None, topic=None, everything=False, playing={}, is_changed=True)
 
 
@@ -128,7 +127,7 @@ def require_new(recording: Path) -> None:
 
 
 def goes_on(running: NodeProcess, wanted: NodeProcess | None) -> bool:
-    """Whether a process can stay when another plan wants its node.
+    """Tell whether a process can stay when another plan wants its node.
 
     Those that record and play follow most parameters while they run.
     """
@@ -140,12 +139,21 @@ def goes_on(running: NodeProcess, wanted: NodeProcess | None) -> bool:
 
 
 def plan_of(request: Request) -> Plan:
-    """The processes that run a scene as requested.
+    """Plan the processes that run a scene as requested.
+
+    The scene's own recording is played, and its end held, where that is its tracker.
 
     Raises:
-        UsSimError: a parameter will not do, or the file to be played cannot be.
+        UsSimError: a parameter will not do, or the file to be played cannot be, or is not named.
     """
-    request = _with_path_of_tracker(request)
+    tracker = request.scene.tracker
+    if tracker.source.name == "path" and not (request.by_hand or request.path):
+        if tracker.file is None:
+            raise SceneError(
+                f"{request.scene.origin}: tracker.file: is missing; name the bag or recording to "
+                f"play"
+            )
+        request = replace(request, path=Path(tracker.file), playing={"stay": True})
     scene, given = request.scene, dict(request.parameters)
     played = "" if request.path is None else str(full_path(request.path))
 
@@ -170,7 +178,8 @@ def plan_of(request: Request) -> Plan:
     if request.record is not None:
         settings = {"file": str(full_path(request.record)), **common}
         settings |= {"path": played} if played else {}
-        processes.append(NodeProcess(RECORDER, settings | recorder))
+        recorder = settings | recorder
+        processes.append(NodeProcess(RECORDER, recorder))
     needed = [part.node for part in scene.parts() if part.needed]
     for node in needed:
         is_played = node == "probe_tracker" and (played or request.by_hand)
@@ -181,17 +190,19 @@ def plan_of(request: Request) -> Plan:
             f"--param {next(iter(given))}: this scene does not run such a node; it runs "
             f"{', '.join(needed)}"
         )
-    for process in processes:
-        if process.node == RECORDER:
-            document = {each.node: {"ros__parameters": each.parameters} for each in processes}
-            process.parameters["parameters"] = yaml.safe_dump(document, sort_keys=False)
+    if request.record is not None:
+        document = {each.node: {"ros__parameters": each.parameters} for each in processes}
+        recorder["parameters"] = yaml.safe_dump(document, sort_keys=False)
     if request.path is None:
         return Plan(processes, duration=request.duration)
     path = path_of(scene, request.path, request.topic or str(player.get("topic") or "") or None)
     topics, space = ["tracker/pose", *scene.ready_topics], namespace()
-    names = {each: posixpath.join(space, each) for each in topics}
-    settings_of = recorder_of(processes)
-    recorded = [each for each in topics if settings_of and settings_of.records(names[each], space)]
+    recording = recorder_of(processes)
+    recorded = [
+        each
+        for each in topics
+        if recording and recording.records(posixpath.join(space, each), space)
+    ]
     settings = {"path": played, "topic": path.topic, "await_topics": topics}
     settings |= {"await_recorded": recorded or [""], **request.playing}  # [] has no type
     poses = None if settings.get("stay") else len(path)
@@ -201,38 +212,21 @@ def plan_of(request: Request) -> Plan:
     return Plan(processes, poses, request.duration, loops=loops, topic=path.topic)
 
 
-def _with_path_of_tracker(request: Request) -> Request:
-    """The same, which plays the scene's own recording where that is its tracker, and holds its end.
-
-    Raises:
-        SceneError: the scene names no recording.
-    """
-    tracker = request.scene.tracker
-    if tracker.source.name != "path" or request.by_hand or request.path:
-        return request
-    if tracker.file is None:
-        raise SceneError(
-            f"{request.scene.origin}: tracker.file: is missing; name the bag or recording to play"
-        )
-    return replace(request, path=Path(tracker.file), playing={"stay": True})
-
-
 def viewer_process(view: ViewerSettings, given: dict[str, object] | None = None) -> NodeProcess:
-    """The process that shows the simulation in browsers, at an address that it says itself."""
+    """Return what shows the simulation in browsers, at an address that it says itself."""
     settings: dict[str, object] = {"host": view.host, "port": view.port}
     if view.recordings:
         settings["recordings"] = view.recordings
-    return NodeProcess(VIEWER, settings | (given or {}), {TOKEN: _viewer_token()})
+    token = os.environ.get(TOKEN) or _TOKEN
+    return NodeProcess(VIEWER, settings | (given or {}), {TOKEN: token})
 
 
-@functools.cache
-def _viewer_token() -> str:
-    """One for as long as this program runs, so that pages find a viewer that was started again."""
-    return os.environ.get(TOKEN) or secrets.token_urlsafe(16)
+_TOKEN = secrets.token_urlsafe(16)
+"""One for as long as this program runs, so that pages find a viewer that was started again."""
 
 
 def recorder_of(processes: Iterable[NodeProcess]) -> SessionRecorderSettings | None:
-    """The settings of the recorder among them."""
+    """Return the settings of the recorder among processes."""
     for process in processes:
         if process.node == RECORDER:
             known = rules_of(SessionRecorderSettings).keys() & process.parameters

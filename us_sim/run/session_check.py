@@ -1,11 +1,10 @@
-"""Whether a recording can be trusted: its index, order, gaps, latency, losses, and unpaired stamps.
+"""Faults of a recording: of its index, order, gaps, latency, losses, and unpaired stamps.
 
 Nothing is decoded but the stamps, so that the time goes into reading the file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -64,12 +63,12 @@ class BagCheck:
 
     @property
     def rows(self) -> list[tuple[str, ...]]:
-        """Titles, and the numbers of each topic; ``-`` where something cannot be told."""
+        """List the titles, and the numbers of each topic; ``-`` where one cannot be told."""
         return [TITLES, *(each.row for each in self.topics)]
 
 
 class TopicCheck:
-    """One topic's messages, as of `read_times`, and what is found on them.
+    """The messages of one topic, as of `read_times`, and the findings on them.
 
     Args:
         bag: the recording.
@@ -181,7 +180,7 @@ class TopicCheck:
         return rate, float(steps.max()) or None
 
     def _times(self, messages: pd.DataFrame) -> NDArray[np.float64]:
-        """When messages were sent, s since the start; or recorded, if another clock sent them."""
+        """Tell when messages were sent, s since the start; or recorded, if by another clock."""
         sent, logged = messages["sent"], messages["logged"]
         times = sent.where((logged - sent).abs() < _OTHER_TIME * SECOND, logged)
         return np.sort((times - self._start) / SECOND)
@@ -225,12 +224,7 @@ class TopicCheck:
 
 
 def check(bag: Bag, progress: Progress = lambda *_: None) -> BagCheck:
-    """Read all of a bag and judge it.
-
-    Args:
-        bag: of a session or of anything else.
-        progress: takes the fraction done, and what is being read.
-    """
+    """Read all of a bag, of a session or of anything else, and judge it."""
     faults: list[Fault] = []
     tables = read_times(bag, None, faults, progress)
     heard = {name: table for name, table in tables.items() if len(table)}
@@ -245,21 +239,17 @@ def check(bag: Bag, progress: Progress = lambda *_: None) -> BagCheck:
     if damaged > 0 and sum(each.missing or 0 for each in topics) <= damaged:
         # The damaged parts held what is missing, and the poses of these stamps.
         findings = [finding for finding in findings if finding.kind not in ("loss", "stamp")]
-    return BagCheck(bag, topics, [*_check_index(bag, faults), *findings])
-
-
-def _check_index(bag: Bag, faults: list[Fault]) -> Iterator[Finding]:
     remedy = f"`us-sim bag repair {bag.path}` writes all that can be read as a new bag"
-    for fault in faults:
-        yield Finding("index", f"{fault.text}: {remedy}")
+    told = [f"{fault.text}: {remedy}" for fault in faults]
     if not bag.is_indexed and not faults:
-        yield Finding("index", f"{bag.path} has no sound index, so that it is read whole: {remedy}")
+        told.append(f"{bag.path} has no sound index, so that it is read whole: {remedy}")
     if not bag.message_count:
-        yield Finding("index", f"{bag.path} holds no message: record again")
+        told.append(f"{bag.path} holds no message: record again")
+    return BagCheck(bag, topics, [*(Finding("index", text) for text in told), *findings])
 
 
 def report(found: BagCheck) -> str:
-    """The table, and a line for each finding, for a person."""
+    """Make the table, and a line for each finding, for a person."""
     size = sum(int(each.messages["size"].sum()) for each in found.topics) / 1e6
     head = f"{found.bag.path}: {found.bag.message_count} messages, {size:.1f} MB"
     told = [f"{each.kind}: {each.text}" for each in found.findings]

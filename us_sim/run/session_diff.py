@@ -1,4 +1,4 @@
-"""Two recordings of the same poses held against each other: are they the same, and where not."""
+"""Two recordings of the same poses held against each other."""
 
 from __future__ import annotations
 
@@ -70,17 +70,12 @@ class SessionDiff:
 
     @property
     def is_none(self) -> bool:
-        """Whether every message has its pair, of the same bytes, and nothing else differs."""
+        """Tell whether every message has its pair, of the same bytes, and all else is the same."""
         return not self.notes and all(row[2:6] == (row[2], row[2], "0", "0") for row in self.rows)
 
 
 def diff(one: Bag, other: Bag, progress: Progress = lambda *_: None) -> SessionDiff:
-    """Compare poses, nodes, wrenches and images of equal stamps.
-
-    Args:
-        one: recording A.
-        other: recording B.
-        progress: takes the fraction done, and what is being compared.
+    """Compare poses, nodes, wrenches and images of equal stamps in recordings A and B.
 
     Raises:
         BagError: a recording is damaged, or the two have no topic or no stamp in common.
@@ -154,13 +149,13 @@ def _compare(one: Bag, other: Bag, name: str) -> tuple[list[tuple[str, ...]], st
 
 
 def _places(bag: Bag, name: str) -> pd.DataFrame:
-    """The stamps of a topic with their places; each once, or with the number of its repetition."""
+    """List the stamps of a topic with their places, and the number of each stamp's repetition."""
     found = read_times(bag, [name])[name].query("is_short == 0")[["stamp"]]
     return found.assign(again=found.groupby("stamp").cumcount(), place=found.index)
 
 
 def _numbered(bag: Bag, name: str, places: pd.Series) -> Iterator[BagMessage]:
-    """The messages of a topic that have these places, in this order."""
+    """Read the messages of a topic that have these places, in this order."""
     messages = enumerate(bag.messages([name]))
     wanted, waiting = {*places}, dict[int, BagMessage]()
     for place in places:
@@ -172,7 +167,7 @@ def _numbered(bag: Bag, name: str, places: pd.Series) -> Iterator[BagMessage]:
 
 
 def table(found: SessionDiff) -> str:
-    """The numbers below each other, and what could not be compared."""
+    """Write the numbers below each other, and what could not be compared."""
     rows = aligned([HEAD, *found.rows], left=(0, 1))
     lines = [f"A {found.paths[0]}", f"B {found.paths[1]}", "", *rows, "", *found.notes]
     if found.left_out:

@@ -41,11 +41,11 @@ class Session:
     reports: dict[str, dict[str, str]]  # last diagnostics by node
 
     def stamps(self, topic: str) -> list[int]:
-        """Stamps of a topic's messages, ns."""
+        """List the stamps of a topic's messages, ns."""
         return self.times[topic]["stamp"].tolist() if topic in self.times else []
 
     def images_at(self, stamps: Collection[int]) -> dict[int, NDArray[np.uint8]]:
-        """The images with those stamps, (rows, columns) each, read in one pass."""
+        """Read the images with those stamps, (rows, columns) each, in one pass."""
         messages = zip(self.stamps(IMAGE), self.bag.messages([IMAGE]), strict=True)
         return {
             stamp: pixels_from(self.bag.deserialize(message))
@@ -56,7 +56,7 @@ class Session:
     def lumen_areas(
         self, scene: Scene, samples: int, progress: Callable[[float], None] = lambda _: None
     ) -> LumenAreas | None:
-        """Vessel cross-sections at up to ``samples`` images; None without labels or tissue."""
+        """Measure vessels at up to ``samples`` images; None without labels or tissue."""
         meter = self.measured_lumens(scene, samples, progress)
         return meter.areas() if meter is not None else None
 
@@ -67,7 +67,7 @@ class Session:
         progress: Callable[[float], None] = lambda _: None,
         lines: Mapping[str, CentreLine] | None = None,
     ) -> LumenMeter | None:
-        """Likewise, with centre lines of the vessels for their places.
+        """Measure likewise, with centre lines of the vessels for their places.
 
         Raises:
             BagError: no image has its pose and nodes.
@@ -91,7 +91,7 @@ class Session:
         return meter
 
     def scanner_of_vessels(self, scene: Scene) -> tuple[dict[str, tuple[int, ...]], BMode | None]:
-        """Labels of vessels by their names, see `lumens_of`, and the scanner that finds them.
+        """Find labels of vessels by their names, see `lumens_of`, and the scanner for them.
 
         There is no scanner without labels of vessels, or without tissue.
         """
@@ -104,7 +104,7 @@ class Session:
         return numbers, scanner
 
     def summary(self, areas: LumenAreas | None) -> dict[str, Any]:
-        """Everything as one JSON-like mapping; times in ms, areas in mm².
+        """Sum all up as one JSON-like mapping; times in ms, areas in mm².
 
         A latency is the age of the pose when what followed from it was sent, or, ``end_to_end``,
         when its image had arrived at the recorder.

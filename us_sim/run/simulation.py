@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Collection
 from dataclasses import replace
@@ -10,14 +9,13 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from us_sim.errors import BagError, SceneError, SettingsError, UsSimError
+from us_sim.errors import BagError, SettingsError, UsSimError
 from us_sim.nodes.settings import PLAYERS, RECORDER, VIEWER, SessionControlSettings
 from us_sim.run.plan import Request, plan_of, require_new
 from us_sim.run.supervision import Supervisor, say
 from us_sim.scene.building import path_of
 from us_sim.scene.listing import ListedScene, listed_scene, listed_scenes
 from us_sim.scene.reading import check_files, load_scene
-from us_sim.scene.scene import Scene
 from us_sim.share import find_bag, full_path, shared_roots
 
 _BAGS_EVERY_S = 2.0
@@ -119,9 +117,6 @@ class Simulation:
                 playing=playing | {"stay": True},
             )
         self._change(request)
-        self._steer(wanted, named)
-
-    def _steer(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
         values: dict[str, object] = {
             name: getattr(wanted, key) for key, name in _OF_PLAYER.items() if key in named
         }
@@ -179,10 +174,9 @@ class Simulation:
             self._listed.clear()
 
     def _list_bags(self) -> None:
-        now = time.monotonic()
+        now, view = time.monotonic(), self._request.view
         if now - self._bags_at < _BAGS_EVERY_S:
             return
-        view = self._request.view
         self._bags_at, bags = now, bags_in_reach(view.recordings if view else None)
         if bags != self._bags:
             self._bags = bags
@@ -219,26 +213,17 @@ class Simulation:
         self._control.tell(state, values, self._problem)
 
     def _shown(self) -> SessionControlSettings:
-        """The control's parameters as things are."""
-        request, scene = self._request, self._request.scene
+        """Return the control's parameters as things are."""
+        request = self._request
         playing: Any = request.playing
         return SessionControlSettings(
-            scene=scene.origin,
-            volume=_volume_of(scene),
+            scene=request.scene.origin,
+            volume=request.scene.volume.file,
             record=str(request.record) if request.record else None,
             replay=str(request.path) if request.path else None,
             replay_as="recording" if request.everything else "path",
             **{key: playing[name] for key, name in _OF_PLAYER.items() if name in playing},
         )
-
-
-def _volume_of(scene: Scene) -> str | None:
-    """Return a volume file that takes the place of the scene's own."""
-    own = None
-    if scene.volume.file is not None:
-        with contextlib.suppress(SceneError):  # it has none of its own
-            own = load_scene(scene.origin).volume.file
-    return scene.volume.file if scene.volume.file != own else None
 
 
 def bags_in_reach(recordings: str | None = None) -> dict[str, str]:

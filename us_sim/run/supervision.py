@@ -70,7 +70,7 @@ class Loss:
     given_up: str = ""  # why it was not started again
 
     def __str__(self) -> str:
-        """For a person."""
+        """Say it to a person."""
         then = f" and {self.given_up}" if self.given_up else ""
         if self.back_after_s is not None:
             then = f" and was back after {self.back_after_s:.1f} s"
@@ -79,7 +79,7 @@ class Loss:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run went."""
+    """The result of a run."""
 
     startup: float  # s until all nodes were ready
     files: Sequence[Path]  # recorded, in their order
@@ -226,7 +226,7 @@ class Supervisor:
 
     @property
     def waiting(self) -> list[str]:
-        """Nodes that have not reported yet, or not yet again."""
+        """List the nodes that have not reported yet, or not yet again."""
         heard = self.monitor.heard
         return [node for node, each in self._running.items() if (node, each.pid) not in heard]
 
@@ -316,7 +316,7 @@ class Supervisor:
         if self._restarts[node] >= limit:
             given_up = f"is not started again after {counted(limit, 'restart')}"
         loss = self._note(node, what, said, given_up)
-        self._publish()
+        self.monitor.tell_lost([str(each) for each in self.losses])
         self._restarts[node] += 1
         if given_up:
             self._away.pop(node, None)
@@ -339,7 +339,7 @@ class Supervisor:
         for node in [node for node in self._away if node not in waiting]:
             loss = self._away.pop(node)
             loss.back_after_s = round(time.monotonic() - self._began - loss.at_s, 2)
-            self._publish()
+            self.monitor.tell_lost([str(each) for each in self.losses])
             say(f"{node} is back after {loss.back_after_s:.1f} s")
 
     def _note_strangers(self) -> None:
@@ -357,9 +357,6 @@ class Supervisor:
         last = f", and last said: {said}" if said else ""
         say(f"{node} {what} after {loss.at_s:.1f} s{last}; {given_up or 'it is started again'}")
         return loss
-
-    def _publish(self) -> None:
-        self.monitor.tell_lost([str(loss) for loss in self.losses])
 
 
 def say(sentence: str) -> None:
