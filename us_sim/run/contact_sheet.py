@@ -12,7 +12,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from us_sim.errors import BagError
-from us_sim.geometry.pose import Pose
 from us_sim.run.session_summary import IMAGE, Session
 from us_sim.run.session_tables import SECOND
 from us_sim.scene.building import colour_of, probe_of
@@ -20,16 +19,7 @@ from us_sim.scene.scene import Scene
 from us_sim.scoring.lumen import LumenAreas
 from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
 from us_sim.slicing.frame import Frame
-from us_sim.slicing.probe.probe import Probe
 from us_sim.volume.structure_names import Colour, anatomical_colour
-
-
-def _show(axes: Any, pixels: Any, probe: Probe) -> None:
-    """Draw an image over its extent in mm."""
-    corners = np.array([[-0.5, -0.5, 0, 1], [probe.columns - 0.5, probe.rows - 0.5, 0, 1]])
-    (left, _, top), (right, _, bottom) = 1e3 * (corners @ probe.image_to_probe.T)[:, :3]
-    axes.imshow(pixels, cmap="gray", vmin=0, vmax=255, extent=(left, right, bottom, top))
-    axes.tick_params(labelsize=8)
 
 
 def _draw_outlines(axes: Any, frame: Frame, colours: Mapping[int, Colour]) -> None:
@@ -55,17 +45,23 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(len(heights), 3, height_ratios=heights)
     probe, first = probe_of(scene), min(session.poses)
+    corners = np.array([[-0.5, -0.5, 0, 1], [probe.columns - 0.5, probe.rows - 0.5, 0, 1]])
+    (left, _, top), (right, _, bottom) = 1e3 * (corners @ probe.image_to_probe.T)[:, :3]
     numbers, scanner = session.scanner_of_vessels(scene)
     images = session.images_at({*moments.values()})
     times = [(stamp - first) / SECOND for stamp in moments.values()]
     for i, (title, stamp) in enumerate(moments.items()):
         axes, pose = figure.add_subplot(grid[divmod(i, 3)]), session.poses[stamp]
-        _show(axes, images[stamp], probe)
-        if scanner is not None and stamp in session.nodes and pose.position[2] > 0.0:
+        extent = (left, right, bottom, top)
+        axes.imshow(images[stamp], cmap="gray", vmin=0, vmax=255, extent=extent)
+        axes.tick_params(labelsize=8)
+        depth = 1e3 * float(pose.position[2])
+        if scanner is not None and stamp in session.nodes and depth > 0.0:
             # Through air nothing is seen.
             lumens = {n: _colour(scene, name) for name in numbers for n in numbers[name]}
             _draw_outlines(axes, scanner.frame(pose, session.nodes[stamp]), lumens)
-        axes.set_title(f"{title}: t = {times[i]:.2f} s, {_place(pose)}", fontsize=11)
+        place = f"pressed {depth:.1f} mm" if depth > -0.05 else f"in the air, {-depth:.1f} mm high"
+        axes.set_title(f"{title}: t = {times[i]:.2f} s, {place}", fontsize=11)
         axes.set_xlabel("lateral, mm" if areas is None else _caption(areas, times[i]), fontsize=12)
         if i % 3 == 0:
             axes.set_ylabel("depth, mm")
@@ -73,11 +69,9 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
     if areas is not None:
         colours = {name: _colour(scene, name) for name in areas.area}
         _plot_areas(figure.add_subplot(grid[-1, :]), areas, times, colours)
-    figure.supxlabel(_DARK, fontsize=11)
+    dark = "Beams of the part of the face that does not touch the skin stay dark."
+    figure.supxlabel(dark, fontsize=11)
     figure.savefig(file, dpi=80)
-
-
-_DARK = "Beams of the part of the face that does not touch the skin stay dark."
 
 
 def pick_moments(session: Session) -> dict[str, int]:
@@ -104,12 +98,6 @@ def pick_moments(session: Session) -> dict[str, int]:
         "after": -1,
     }
     return {title: stamps[i] for title, i in picked.items()}
-
-
-def _place(pose: Pose) -> str:
-    """How far the probe is over or below the skin at rest."""
-    depth = 1e3 * float(pose.position[2])
-    return f"pressed {depth:.1f} mm" if depth > -0.05 else f"in the air, {-depth:.1f} mm high"
 
 
 def _caption(areas: LumenAreas, time: float) -> str:

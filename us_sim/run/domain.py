@@ -73,8 +73,7 @@ def enclave_of(node: str) -> str:
 def alone_on_domain(space: str | None = None) -> Iterator[None]:
     """Have the domain to oneself, as far as simulations in a namespace and on this host go.
 
-    Args:
-        space: the namespace; None is that of ``--ros-args``.
+    Without ``space`` that is the namespace of ``--ros-args``.
 
     Raises:
         UsSimError: another simulation has it.
@@ -95,10 +94,7 @@ def alone_on_domain(space: str | None = None) -> Iterator[None]:
 
 
 def ros_context(number: int | None = None) -> Context:
-    """Return a context that handles no signals.
-
-    Args:
-        number: of the ROS domain; None is the environment's.
+    """Return a context that handles no signals, on the domain of this number or the environment's.
 
     Raises:
         UsSimError: ROS cannot be used.

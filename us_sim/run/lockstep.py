@@ -32,13 +32,10 @@ _RECORDED: dict[str, object] = {
 def render(request: Request, out: Path, *, truth: bool = False) -> int:
     """Run a scene along its path: ``out/images/*.png`` and ``out/session.mcap``.
 
-    Args:
-        request: the scene, its path and parameters.
-        out: folder to write to; empty or new.
-        truth: write what is known of each image beside it, too.
+    With ``truth`` what is known of each image is written beside it, too.
 
     Raises:
-        UsSimError: bad input, or an output that cannot be written.
+        UsSimError: bad input, or ``out`` is not empty or cannot be written.
     """
     prepare_ros(network=False)
     request = replace(request.with_path(), record=out / "session.mcap")
@@ -138,15 +135,13 @@ def _spin(
     changed, last = clock.now().nanoseconds, (-1, -1)
     while True:
         executor.spin_once(timeout_sec=0.05)
-        failure = next(filter(None, (getattr(node, "last_failure", "") for node in nodes)), "")
-        if failure:  # the node itself would go on
-            raise UsSimError(failure)
+        for node in nodes:
+            if failure := getattr(node, "last_failure", ""):  # the node itself would go on
+                raise UsSimError(failure)
         images, files = writer.counts["ultrasound/image"], writer.counts.total()
-        state = (images, recorder.health.received + files)
-        now = clock.now().nanoseconds
+        state, now = (images, recorder.health.received + files), clock.now().nanoseconds
         if state != last:
-            if state[0] != last[0]:
-                progress(state[0])
+            progress(images)
             changed, last = now, state
         silence = (now - changed) * 1e-9
         is_complete = files == (1 + len(truth)) * images

@@ -239,12 +239,8 @@ def prepare_scene(scene: Scene, path: Path | None = None, topic: str | None = No
     """Make a phantom that is not in the cache yet, in view of the person who waits.
 
     The tissue of a case is made too, and kept there. Of a phantom that is there nothing is
-    read, unless a path is played: its nodes do that, and notice damage.
-
-    Args:
-        scene: whose volume is made.
-        path: that will be played.
-        topic: of the body in it.
+    read, unless a path, or the body of a topic in it, is to be played: its nodes do that, and
+    notice damage.
 
     Raises:
         UsSimError: the volume cannot be read, or no image along the path shows any of it.

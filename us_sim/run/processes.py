@@ -45,12 +45,9 @@ def begin_fork_server() -> None:
 
 
 def prepare_ros(*, network: bool) -> None:
-    """Require rclpy, and keep what is started from here on this host.
+    """Require rclpy, and keep what is started from here on this host, unless ``network`` is true.
 
     Nobody on a hospital's network should meet a simulator by accident.
-
-    Args:
-        network: talk beyond this host, as the environment says.
 
     Raises:
         UsSimError: rclpy is not installed.
@@ -141,14 +138,10 @@ class RunningNode:
 
 
 def end_nodes(nodes: Collection[RunningNode], limit: float = STOP_S) -> list[str]:
-    """End these nodes; the names of those that had to be killed.
+    """End these nodes together; return the names of those that had to be killed.
 
-    SIGTERM first, SIGKILL at the last. Unlike SIGINT, SIGTERM ends a process without a word while
-    it is still importing.
-
-    Args:
-        nodes: that are ended together.
-        limit: s, which they may take.
+    SIGTERM first, SIGKILL after ``limit`` seconds. Unlike SIGINT, SIGTERM ends a process without a
+    word while it is still importing.
     """
     for each in nodes:
         each.send_signal(signal.SIGTERM)

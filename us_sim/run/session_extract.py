@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterator
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -42,13 +44,9 @@ _UNITS = {
 def write_parts(
     bag: Bag, folder: Path, parts: Collection[str], progress: Progress
 ) -> Iterator[Path | str]:
-    """Write parts of a recording; what is odd or left out is said in sentences among the files.
+    """Write some of ``poses``, ``wrench``, ``images`` and ``areas`` of a recording as files.
 
-    Args:
-        bag: the recording.
-        folder: gets the files.
-        parts: some of ``poses``, ``wrench``, ``images`` and ``areas``.
-        progress: is called meanwhile.
+    What is odd or left out is said in sentences among their names.
 
     Raises:
         BagError: the bag lacks a part, a file exists, or cannot be written.
@@ -131,14 +129,12 @@ def _write_areas(bag: Bag, folder: Path, progress: Progress) -> Path:
 
 
 def _file_name(topic: str) -> str:
-    kept = "".join(c if c.isalnum() or c in "._-" else "_" for c in topic.strip("/"))
-    return kept or "topic"
+    return re.sub(r"[^\w.-]", "_", topic.strip("/")) or "topic"
 
 
 def _seconds(nanoseconds: int) -> str:
-    """Seconds with all nine digits, which a float has not since 1970."""
-    sign = "-" if nanoseconds < 0 else ""
-    return f"{sign}{abs(nanoseconds) // SECOND}.{abs(nanoseconds) % SECOND:09d}"
+    """Write seconds with all nine digits, which a float has not since 1970."""
+    return f"{Decimal(int(nanoseconds)).scaleb(-9):.9f}"
 
 
 def _spacing(bag: Bag, name: str) -> list[float]:

@@ -38,7 +38,7 @@ def read_scan(
         file: the recording.
         topic: of the poses, as for `read_path`.
         wrench: topic of the force; by default ``probe/wrench``, or the only one of its type.
-        progress: is called meanwhile.
+        progress: is called while areas are measured.
 
     Raises:
         BagError: there are no poses, or what was named is not there.

@@ -39,13 +39,8 @@ def read_times(
 ) -> dict[str, pd.DataFrame]:
     """Read when messages were stamped, sent and logged, their numbers and sizes, by topic.
 
-    ``is_short`` is 1 for a message that ends before its stamp. Nothing else is decoded.
-
-    Args:
-        bag: the recording.
-        topics: names of topics; None for all.
-        faults: takes what is wrong with the bag, all of which is read then.
-        progress: is called meanwhile.
+    ``is_short`` is 1 for a message that ends before its stamp. Nothing else is decoded. Without
+    ``topics`` all are read. ``faults`` takes what is wrong with the bag, all of which is read then.
 
     Raises:
         BagError: the bag is damaged, and ``faults`` is None; or it has no such topic.
@@ -100,11 +95,7 @@ VALUES: Mapping[str, Callable[[Any], dict[str, float]]] = {
 
 
 def read_values(bag: Bag, name: str) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Read poses, wrenches, twists or joint positions.
-
-    Args:
-        bag: the recording.
-        name: a topic, or a body as in `recording.path`, such as ``/tf:probe``.
+    """Read poses, wrenches, twists or joint positions of a topic, or a body such as ``/tf:probe``.
 
     Returns:
         ``stamp``, ``logged`` and ``frame`` of each message, and its numbers in columns of their

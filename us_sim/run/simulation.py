@@ -28,13 +28,9 @@ _OF_PLAYER = {"replay_rate": "rate", "replay_loop": "loop", "replay_paused": "pa
 
 
 class Simulation:
-    """Does as `session_control` says: it gives the supervisor other plans.
+    """A request and the supervisor of its plan, who gets other plans as `session_control` says.
 
     Where a plan turns out not to work, the one before runs again.
-
-    Args:
-        request: that the supervisor's plan was made for.
-        supervisor: of the nodes.
     """
 
     def __init__(self, request: Request, supervisor: Supervisor) -> None:
@@ -230,9 +226,7 @@ def bags_in_reach(recordings: str | None = None) -> dict[str, str]:
     """Return bags that can be replayed: files by names, the newest first, installed ones last.
 
     A bag of several files is one with its folder; each of these files is a bag of its own, too.
-
-    Args:
-        recordings: folder to which pages record, wherever that is.
+    Pages record to the folder ``recordings``, wherever that is.
     """
     here = Path.cwd()
     own = [(here, here), (here / "bags", here)]

@@ -1,7 +1,6 @@
 """Node processes watched and started again, and what was lost meanwhile.
 
-A `Supervisor` keeps the nodes of a plan running: one that ends, or that says nothing on
-``diagnostics`` for too long, is started again.
+A node hangs that says nothing on ``diagnostics`` for too long.
 """
 
 from __future__ import annotations
@@ -110,7 +109,7 @@ def images_in(files: Sequence[Path], name: str) -> int:
 
 
 class Supervisor:
-    """Starts the nodes of a plan and keeps them running: one that ends or hangs is started again.
+    """The keeper of a plan's running nodes: one that ends or hangs is started again.
 
     Another plan may take its place while it runs. What is noticed is said, kept in `losses`, and
     published on ``diagnostics``, so that it is in the recording.
@@ -139,7 +138,6 @@ class Supervisor:
         self._began = time.monotonic()
         self._startup: float | None = None  # s
         self._changes = 0
-        self._is_settled = False  # whether all nodes of the plan have been ready
 
     def start(self, plan: Plan) -> None:
         """Start the nodes of a plan, and hear them; a page loads while ROS is imported here."""
@@ -175,12 +173,7 @@ class Supervisor:
         return control
 
     def change(self, plan: Plan, anew: Collection[str] = ()) -> None:
-        """Run this plan; processes that the plan before had, too, go on.
-
-        Args:
-            plan: what runs from now on.
-            anew: nodes that do not go on even so.
-        """
+        """Run this plan; processes that it shares with the one before go on, but for ``anew``."""
         wanted = {process.node: process for process in plan.processes}
         over = [
             process.node
@@ -195,7 +188,6 @@ class Supervisor:
         self.plan, self.finished = plan, False
         self._restarts.clear()
         self._changes += 1
-        self._is_settled = False
         self.monitor.follow(plan.nodes)
         self._start(each for each in plan.processes if each.node not in self._running)
 
@@ -321,7 +313,7 @@ class Supervisor:
         if given_up:
             self._away.pop(node, None)
             self.finished |= node == self.plan.player
-            if not self._is_settled:
+            if not self._were_ready.issuperset(self.plan.nodes):
                 raise UsSimError(str(loss))
             return
         report = self.monitor.reports.get(node, {})
@@ -332,7 +324,6 @@ class Supervisor:
 
     def _note_ready(self) -> None:
         waiting = self.waiting
-        self._is_settled |= not waiting
         if not waiting and self._startup is None:
             self._startup = time.monotonic() - self._began
         self._were_ready |= self._running.keys() - set(waiting)
@@ -367,13 +358,9 @@ def say(sentence: str) -> None:
 def going_on(process: NodeProcess, report: Mapping[str, str]) -> NodeProcess:
     """Return the process that goes on in place of one that has ended.
 
-    A recorder goes on in a further file, and a viewer at the port where pages look for it. What
-    plays a path goes on where that would be by now, as a tracker's motion would: what it did not
-    send meanwhile is missing.
-
-    Args:
-        process: as it was started at first.
-        report: the last that it gave.
+    A recorder goes on in a further file, and a viewer at the port where pages look for it, as its
+    last report says. What plays a path goes on where that would be by now, as a tracker's motion
+    would: what it did not send meanwhile is missing.
     """
     if process.node == RECORDER:
         more: dict[str, object] = {"if_exists": "further"}
