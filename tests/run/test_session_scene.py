@@ -8,7 +8,7 @@ from us_sim.errors import BagError
 from us_sim.nodes.sessions.attachments import session_attachments
 from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.recording.reader import read_bag
-from us_sim.run.session_scene import scene_of
+from us_sim.run.session_summary import scene_of
 from us_sim.volume.files.writing import write_volume
 from us_sim.volume.volume import Volume
 

@@ -17,8 +17,7 @@ from us_sim.recording.decoding import affine_from
 from us_sim.recording.reader import Bag
 from us_sim.recording.repair import new_file
 from us_sim.run.session_lerobot import PIXELS
-from us_sim.run.session_scene import scene_of
-from us_sim.run.session_summary import read_session
+from us_sim.run.session_summary import read_session, scene_of
 from us_sim.run.session_tables import (
     SECOND,
     WRENCH_STAMPED,

@@ -1,8 +1,10 @@
-"""A recorded session measured: counts, latency and lumen areas."""
+"""A recorded session, its scene, and what is measured of it: counts, latency and lumen areas."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+import contextlib
+import tempfile
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,10 +15,13 @@ from numpy.typing import NDArray
 
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
+from us_sim.nodes.sessions.attachments import checksum
 from us_sim.recording.decoding import pixels_from, pose_from, tetrahedra_from, vectors_from
 from us_sim.recording.reader import Bag, read_bag
+from us_sim.recording.repair import extract
 from us_sim.run.session_tables import SECOND, read_times
 from us_sim.scene.building import scanner_of, volume_of
+from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 from us_sim.scoring.centre_line import CentreLine
 from us_sim.scoring.lumen import LumenAreas, LumenMeter, lumens_of
@@ -25,10 +30,10 @@ from us_sim.slicing.b_mode import BMode
 IMAGE, POSE, NODES = "/ultrasound/image", "/probe/pose", "/tissue/nodes"
 PLAYED = "/tracker/pose"
 STAMPED = (PLAYED, POSE, NODES, "/skin/nodes", IMAGE)
-OTHERS = ("/tissue/rest", "/tissue/tetrahedra", "/diagnostics")
+REST, TETRAHEDRA, REPORTS = "/tissue/rest", "/tissue/tetrahedra", "/diagnostics"
 
 
-@dataclass(frozen=True)
+@dataclass
 class Session:
     """A recorded session, read once: everything but the images is kept."""
 
@@ -160,26 +165,47 @@ def read_session(file: Path, *further: Path) -> Session:
     bag = read_bag(file, *further)
     there = {topic.name for topic in bag.topics if topic.message_count}
     times = read_times(bag, sorted(there & {*STAMPED}))
-    decoded: dict[str, list[Any]] = {topic: [] for topic in (POSE, NODES, *OTHERS)}
-    for message in bag.messages(sorted(there & decoded.keys())):
-        decoded[message.topic].append(bag.deserialize(message))
+    session = Session(bag, {}, {}, None, None, times, {})
+    stamps = {topic: iter(session.stamps(topic)) for topic in (POSE, NODES)}
+    for message in bag.messages(sorted(there & {POSE, NODES, REST, TETRAHEDRA, REPORTS})):
+        content = bag.deserialize(message)
+        if message.topic == POSE:
+            session.poses[next(stamps[POSE])] = pose_from(content)
+        elif message.topic == NODES:
+            session.nodes[next(stamps[NODES])] = vectors_from(content)
+        elif message.topic == REST:
+            session.rest = vectors_from(content)
+        elif message.topic == TETRAHEDRA:
+            session.tetrahedra = tetrahedra_from(content)
+        else:
+            for status in content.status:
+                report = {item.key: item.value for item in status.values}
+                session.reports[status.name.rsplit("/", 1)[-1]] = report
+    return session
 
-    def by_stamp(topic: str, value: Callable[[Any], Any]) -> dict[int, Any]:
-        stamps = times[topic]["stamp"].tolist() if topic in times else []
-        return dict(zip(stamps, map(value, decoded[topic]), strict=True))
 
-    rest, tetrahedra, statuses = (decoded[topic] for topic in OTHERS)
-    reports = {
-        status.name.rsplit("/", 1)[-1]: {item.key: item.value for item in status.values}
-        for message in statuses
-        for status in message.status
-    }
-    return Session(
-        bag,
-        by_stamp(POSE, pose_from),
-        by_stamp(NODES, vectors_from),
-        vectors_from(rest[-1]) if rest else None,
-        tetrahedra_from(tetrahedra[-1]) if tetrahedra else None,
-        times,
-        reports,
-    )
+@contextlib.contextmanager
+def scene_of(bag: Bag) -> Iterator[Scene]:
+    """Unpack the scene that is attached to a session, for a while.
+
+    Raises:
+        BagError: there is none, or a file of it that was too large to be attached is another now.
+        UsSimError: a file cannot be read or written.
+    """
+    attached = bag.attachments()
+    if "scene.yaml" not in attached:
+        raise BagError(
+            f"{bag.path} has no scene attached: name the scene, and play it with "
+            f"`us-sim render SCENE --path {bag.path}`"
+        )
+    with tempfile.TemporaryDirectory(prefix="us_sim_session_") as folder:
+        unpacked = extract(bag.path, Path(folder))
+        listed = attached["files.txt"].data.decode() if "files.txt" in attached else ""
+        there = {checksum(file) for file in unpacked}
+        for digest, _, name in (line.partition("  ") for line in listed.splitlines()):
+            if digest not in there and checksum(Path(name)) != digest:
+                raise BagError(
+                    f"{name} is not the file that {bag.path} was recorded with, and was too large "
+                    f"to be attached: bring that one back"
+                )
+        yield load_scene(Path(folder, "scene.yaml"))
