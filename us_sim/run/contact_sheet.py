@@ -18,19 +18,7 @@ from us_sim.scene.building import colour_of, probe_of
 from us_sim.scene.scene import Scene
 from us_sim.scoring.lumen import LumenAreas
 from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
-from us_sim.slicing.frame import Frame
 from us_sim.volume.structure_names import Colour, anatomical_colour
-
-
-def _draw_outlines(axes: Any, frame: Frame, colours: Mapping[int, Colour]) -> None:
-    """Draw the outlines of labels over the frame's image."""
-    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    scale = np.array([right - left, bottom - top]) / frame.labels.shape[::-1]
-    refine = partial(onto_border, frame)
-    for label, colour in colours.items():
-        for outline in label_outlines(frame.labels, label, refine=refine):
-            axes.fill(*((outline + 0.5) * scale + (left, top)).T, fill=False, ec=colour, lw=1)
-    axes.set(xlim=(left, right), ylim=(bottom, top))
 
 
 def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file: Path) -> None:
@@ -48,6 +36,7 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
     corners = np.array([[-0.5, -0.5, 0, 1], [probe.columns - 0.5, probe.rows - 0.5, 0, 1]])
     (left, _, top), (right, _, bottom) = 1e3 * (corners @ probe.image_to_probe.T)[:, :3]
     numbers, scanner = session.scanner_of_vessels(scene)
+    lumens = {n: _colour(scene, name) for name in numbers for n in numbers[name]}
     images = session.images_at({*moments.values()})
     times = [(stamp - first) / SECOND for stamp in moments.values()]
     for i, (title, stamp) in enumerate(moments.items()):
@@ -58,8 +47,14 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
         depth = 1e3 * float(pose.position[2])
         if scanner is not None and stamp in session.nodes and depth > 0.0:
             # Through air nothing is seen.
-            lumens = {n: _colour(scene, name) for name in numbers for n in numbers[name]}
-            _draw_outlines(axes, scanner.frame(pose, session.nodes[stamp]), lumens)
+            frame = scanner.frame(pose, session.nodes[stamp])
+            scale = np.array([right - left, bottom - top]) / frame.labels.shape[::-1]
+            for label, colour in lumens.items():
+                refine = partial(onto_border, frame)
+                for outline in label_outlines(frame.labels, label, refine=refine):
+                    x, y = ((outline + 0.5) * scale + (left, top)).T
+                    axes.fill(x, y, fill=False, ec=colour, lw=1)
+            axes.set(xlim=(left, right), ylim=(bottom, top))
         place = f"pressed {depth:.1f} mm" if depth > -0.05 else f"in the air, {-depth:.1f} mm high"
         axes.set_title(f"{title}: t = {times[i]:.2f} s, {place}", fontsize=11)
         axes.set_xlabel("lateral, mm" if areas is None else _caption(areas, times[i]), fontsize=12)

@@ -54,12 +54,8 @@ def follow(
 ) -> Outcome:
     """Start the plan's processes and stay with them until they are done; return how it went.
 
-    Args:
-        plan: what runs.
-        log: as for `Supervisor`, as are the settings.
-        settings: of restarts.
-        request: that the plan was made for, which may change while it runs. None where what runs
-            is no simulation, of which there is one on a domain.
+    The ``request`` that the plan was made for may change while it runs. Without one what runs is no
+    simulation, of which there is one on a domain.
 
     Raises:
         UsSimError: a node cannot start, or another simulation runs on this domain.

@@ -70,12 +70,7 @@ class BagCheck:
 class TopicCheck:
     """The messages of one topic, as of `read_times`, and the findings on them.
 
-    Args:
-        bag: the recording.
-        topic: of it.
-        messages: of the topic.
-        poses: that the messages follow from, if they follow from any.
-        is_numbered: whether the messages are numbered by themselves.
+    They may follow from poses, and be numbered by themselves.
     """
 
     def __init__(

@@ -63,16 +63,10 @@ def to_lerobot(
     is_video: bool = False,
     **wanted: Any,
 ) -> list[str]:
-    """Write sessions as episodes, and say of each topic what became of its messages.
+    """Write bags of any kind as episodes, and say of each topic what became of its messages.
 
-    Args:
-        sessions: bags of any kind.
-        folder: to make.
-        task: in words.
-        progress: is called meanwhile.
-        rate: frames a second; None is the `usual_rate` of the first session.
-        is_video: code images as video, which loses speckle.
-        wanted: their parts, as for `Episode`.
+    They have ``rate`` frames a second, or the `usual_rate` of the first. What is ``wanted`` of each
+    is said as for `Episode`, and all else as for `write_episodes`.
 
     Raises:
         BagError: a session cannot be read, or has nothing that is wanted, or at no time all of it.
@@ -222,13 +216,13 @@ class Episode:
 
     @property
     def usual_rate(self) -> int:
-        """Frames a second: of the images, or else of what is fastest."""
+        """Find the frames a second of the images, or else of what is fastest."""
         steps = [np.median(np.diff(each.times)) for each in self._images or self._tracks]
         return int(np.clip(round(SECOND / min(steps)), 1, _HIGHEST_RATE))
 
     @property
     def names(self) -> dict[str, Sequence[str]]:
-        """Of the numbers of each feature."""
+        """Name the numbers of each feature."""
         return {
             feature: [f"{each.name.strip('/')}.{part}" for each in tracks for part in each.table]
             for feature, tracks in self._numbers.items()

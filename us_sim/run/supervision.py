@@ -126,7 +126,7 @@ class Supervisor:
         self.losses: list[Loss] = []
         self.finished = False  # whether what is played is at its end, or given up
         self._settings, self._log_path = settings, log
-        self._log: IO[str] | None = log.open("w", encoding="utf-8") if log else None
+        self._log: IO[str] | None = log.open("w", 1, encoding="utf-8") if log else None  # by lines
         self._listening = contextlib.ExitStack()  # leaves the domain
         self._running: dict[str, RunningNode] = {}  # the last process of each node
         self._started: set[tuple[str, int]] = set()  # nodes and processes
@@ -211,7 +211,6 @@ class Supervisor:
         if self._log is not None:
             with contextlib.suppress(OSError, ValueError):  # a full disk; or it is closed
                 self._log.write(line)
-                self._log.flush()
         is_for_person = self._log is None or node == VIEWER  # which says where its page is
         if is_for_person and not line.startswith(COMPLAINT):  # which is said when it has ended
             tqdm.write(printable(line.rstrip()), file=sys.stderr)
