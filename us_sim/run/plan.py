@@ -40,11 +40,11 @@ class NodeProcess:
 
     @property
     def module(self) -> str:
-        """The module that runs it."""
+        """Name the module that runs it."""
         return "us_sim.viewer.viewer" if self.node == VIEWER else f"us_sim.nodes.{self.node}"
 
     def arguments(self) -> list[str]:
-        """ROS arguments: its enclave, those that all nodes get, and its parameters."""
+        """List its ROS arguments: its enclave, those that all nodes get, and its parameters."""
         arguments = ["--ros-args", "--enclave", enclave_of(self.node), *ros_arguments()]
         for name, value in self.parameters.items():
             arguments += ["-p", f"{name}:={json.dumps(value)}"]

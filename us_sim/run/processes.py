@@ -116,7 +116,7 @@ class RunningNode:
 
     @property
     def status(self) -> int | None:
-        """The exit status; None while it runs, negative for a signal."""
+        """Return the exit status; None while it runs, negative for a signal."""
         status: int | None = self._process.exitcode
         return INTERRUPTED if status == _UNKNOWN else status  # it is told to end then
 

@@ -239,12 +239,11 @@ class Episode:
             known = [each.table[name].dropna().index for name in each.table]
             begins.append(max(int(times[0]) for times in known))
             ends.append(min(int(times[-1]) for times in known))
-        begin, end = max(begins), min(ends)
+        first, begin, end = min(begins), max(begins), min(ends)
         count = (end - begin) * rate // SECOND + 1
         if end <= begin or count > _MOST_FRAMES:
             told = ", ".join(
-                f"{track.name} from {(a - min(begins)) / SECOND:.3f} to "
-                f"{(b - min(begins)) / SECOND:.3f} s"
+                f"{track.name} from {(a - first) / SECOND:.3f} to {(b - first) / SECOND:.3f} s"
                 for track, a, b in zip(self._tracks, begins, ends, strict=True)
             )
             raise BagError(
