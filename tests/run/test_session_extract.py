@@ -133,4 +133,4 @@ def test_attached_files_as_before_without_an_option(tmp_path):
     session = write(tmp_path / "s.mcap", press(3), {"note.txt": b"hello"})
     assert extracted(session, tmp_path / "out") == 0
     assert (tmp_path / "out" / "note.txt").read_bytes() == b"hello"
-    assert read_bag(session).attachments().keys() == {"note.txt"}
+    assert read_bag(session).attachments.keys() == {"note.txt"}

@@ -35,7 +35,7 @@ from us_sim.recording.storage import (
     missing_files,
     open_storage,
 )
-from us_sim.recording.topic import LOST, MARKER, BagAttachment, BagMessage, BagNote, BagTopic, Fault
+from us_sim.recording.topic import LOST, MARKER, BagMessage, BagTopic, Fault
 from us_sim.settings.spelling import aligned
 
 
@@ -47,6 +47,9 @@ class Bag:
         end: highest log time.
         message_count: on all topics.
         is_indexed: whether every file of it has an index, so that none is read to open it.
+        attachments: the files within it, such as the scene that was recorded, by their names.
+        damaged_attachments: the faults of those that are damaged, and left out.
+        notes: the texts that it holds beside its messages.
     """
 
     def __init__(self, path: Path, storages: list[Storage], metadata: BagMetadata | None) -> None:
@@ -67,6 +70,9 @@ class Bag:
         self.end = max((time for time in ends if time is not None), default=None)
         self.message_count = sum(topic.message_count for topic in self.topics)
         self.is_indexed = all(storage.is_indexed for storage in storages)
+        self.attachments = {each.name: each for storage in storages for each in storage.attachments}
+        self.damaged_attachments = [f for storage in storages for f in storage.damaged_attachments]
+        self.notes = [note for storage in storages for note in storage.notes]
 
     @property
     def note(self) -> str:
@@ -77,6 +83,7 @@ class Bag:
     def opening_faults(self) -> list[Fault]:
         """The faults that were found when the bag was opened."""
         found = [fault for storage in self._storages for fault in storage.faults]
+        found += self.damaged_attachments
         if self.metadata is not None:
             if missing := ", ".join(missing_files(self.path, self.metadata)):
                 text = f"{self.path / 'metadata.yaml'} names files that are not there: {missing}"
@@ -94,8 +101,6 @@ class Bag:
     def all_messages(self, faults: list[Fault]) -> Iterator[BagMessage]:
         """Every message that can be read; ``faults`` takes everything that is wrong."""
         faults += self.opening_faults
-        self.attachments(faults)
-        self.notes(faults)
         try:
             yield from self.messages(damage=faults)
         except BagError as error:
@@ -114,33 +119,17 @@ class Bag:
             f"{self.path} has no topic {name}; it has {', '.join(sorted(self._topics)) or 'none'}"
         )
 
-    def attachments(self, damage: list[Fault] | None = None) -> dict[str, BagAttachment]:
-        """The files within the bag, such as the scene that was recorded, by their names.
-
-        Args:
-            damage: takes a fault for each that is damaged, which is then left out.
-
-        Raises:
-            BagError: one is damaged, and ``damage`` is None.
-        """
-        held = (each for storage in self._storages for each in storage.attachments(damage))
-        return {each.name: each for each in held}
-
-    def notes(self, damage: list[Fault] | None = None) -> list[BagNote]:
-        """The texts that the bag holds beside its messages; as `attachments`."""
-        return [note for storage in self._storages for note in storage.notes(damage)]
-
     def markers(self) -> list[tuple[int, str]]:
         """The moments that a person marked: ns since the epoch, and the text."""
-        marked = [note.values for note in self.notes([]) if note.name == MARKER]
+        marked = [note.metadata for note in self.notes if note.name == MARKER]
         return [(_count(values.get("time", "")), values.get("text", "")) for values in marked]
 
     def lost(self) -> Counter[str]:
         """How many messages the recorder says that it lost, by topic."""
         lost: Counter[str] = Counter()
-        for note in self.notes([]):
+        for note in self.notes:
             if note.name == LOST:
-                lost.update({topic: _count(text) for topic, text in note.values.items()})
+                lost.update({topic: _count(text) for topic, text in note.metadata.items()})
         return lost
 
     def messages(
@@ -297,7 +286,7 @@ def describe(bag: Bag) -> str:
     lines += _section("lost", [f"{count} of {topic}" for topic, count in bag.lost().items()])
     marks = [f"{(time - (start or time)) * 1e-9:.3f} s  {text}" for time, text in bag.markers()]
     lines += _section("marked", marks)
-    attached = bag.attachments([]).values()
+    attached = bag.attachments.values()
     lines += _section("attached", [f"{each.name} ({len(each.data)} bytes)" for each in attached])
     return "\n".join(printable(line) for line in lines)
 

@@ -24,8 +24,8 @@ def extract(bag: Path, folder: Path) -> list[Path]:
         BagError: it has none, a name is no file's, a file is there already, or cannot be written;
             or one is damaged, and all others are written.
     """
-    damage: list[Fault] = []
-    attached = read_bag(bag).attachments(damage)
+    source = read_bag(bag)
+    attached, damage = source.attachments, source.damaged_attachments
     if not attached and not damage:
         raise BagError(f"{bag} has no files attached: nothing to extract")
     for name in attached:
@@ -106,11 +106,11 @@ def repair(path: str | Path, out: str | Path) -> Repaired:
     bag = read_bag(path)
     damage = [*bag.opening_faults]
     with BagWriter(out) as writer:
-        for attached in bag.attachments(damage).values():
-            writer.attach(attached.name, attached.media_type, attached.data, attached.time)
-        for note in bag.notes(damage):
+        for attached in bag.attachments.values():
+            writer.attach(attached.name, attached.media_type, attached.data, attached.log_time)
+        for note in bag.notes:
             if note.name != "rosbag2":  # which the writer makes anew
-                writer.note(*note)
+                writer.note(note.name, note.metadata)
         for topic in bag.topics:
             if topic.encoding != "cdr":
                 damage.append(_left_out(topic, f"{topic.encoding} is not CDR"))

@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import zstandard
+from mcap.records import Attachment, Metadata
 from mcap.writer import MCAP0_MAGIC
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
@@ -19,7 +20,7 @@ from us_sim.errors import BagError
 from us_sim.recording.mcap_storage import McapStorage
 from us_sim.recording.metadata import BagMetadata, read_metadata
 from us_sim.recording.schemas import normalized_type
-from us_sim.recording.topic import BagAttachment, BagMessage, BagNote, BagTopic, Fault, QosProfile
+from us_sim.recording.topic import BagMessage, BagTopic, Fault, QosProfile
 
 _SQLITE_MAGIC = b"SQLite format 3\0"
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -36,6 +37,10 @@ class SqliteStorage:
     """
 
     is_indexed = True
+    # rosbag2 keeps neither files nor notes in a database
+    attachments: tuple[Attachment, ...] = ()
+    damaged_attachments: tuple[Fault, ...] = ()
+    notes: tuple[Metadata, ...] = ()
 
     def __init__(self, path: Path, label: str) -> None:
         self._label = label
@@ -50,20 +55,12 @@ class SqliteStorage:
         self._reader = Sqlite3Reader(path)
         try:
             self._reader.open()
-            self.topics = tuple(map(_topic, self._reader.connections))
+            self.topics = [_topic(each) for each in self._reader.connections]
             about = self._reader.metadata
             self.start = int(about.start_time) if about.message_count else None
             self.end = int(about.end_time) - 1 if about.message_count else None
         except Exception as error:  # rosbags' own, SQLite's, and what foreign texts lead to
             raise self._damaged(error) from None
-
-    def attachments(self, _: list[Fault] | None) -> Iterator[BagAttachment]:
-        """None: rosbag2 keeps no files in a database."""
-        return iter(())
-
-    def notes(self, _: list[Fault] | None) -> Iterator[BagNote]:
-        """None."""
-        return iter(())
 
     def messages(
         self, topics: Collection[str], _: list[Fault] | None, since: int | None = None

@@ -149,22 +149,6 @@ class BagMessage(NamedTuple):
     sequence: int = 0  # its number on its topic; 0 where none is kept
 
 
-class BagAttachment(NamedTuple):
-    """A file within a bag."""
-
-    name: str
-    media_type: str
-    time: int  # ns since the epoch
-    data: bytes
-
-
-class BagNote(NamedTuple):
-    """Texts by their names that a bag holds beside its messages."""
-
-    name: str
-    values: dict[str, str]
-
-
 class Fault(NamedTuple):
     """Something that is wrong with a bag."""
 

@@ -55,7 +55,7 @@ def write_parts(
         "poses": bodies_of(bag),
         "wrench": topics_of(bag, WRENCH_STAMPED),
         "images": topics_of(bag, *PIXELS),
-        "areas": [name for name in bag.attachments([]) if name == "scene.yaml"],
+        "areas": [name for name in bag.attachments if name == "scene.yaml"],
     }
     if lacking := [part for part in parts if not needed[part]]:
         missing = " and ".join(f"no {_HELD[part]}" for part in lacking)

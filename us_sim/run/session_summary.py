@@ -192,7 +192,7 @@ def scene_of(bag: Bag) -> Iterator[Scene]:
         BagError: there is none, or a file of it that was too large to be attached is another now.
         UsSimError: a file cannot be read or written.
     """
-    attached = bag.attachments()
+    attached = bag.attachments
     if "scene.yaml" not in attached:
         raise BagError(
             f"{bag.path} has no scene attached: name the scene, and play it with "
