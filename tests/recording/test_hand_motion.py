@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from us_sim.errors import BagError
 from us_sim.evaluation.hand.hand_motion import APPROACH, HASTES, KINDS, RATE, hand_motion
 from us_sim.recording.path import read_path
 from us_sim.recording.press_and_slide import press_and_slide, pressing_path
@@ -89,9 +88,3 @@ def test_a_press_of_a_case_is_made_once_and_kept(tmp_path, monkeypatch):
     made = file.stat().st_mtime_ns
     assert read_path(file).positions[:, 2].max() == pytest.approx(7e-3)
     assert pressing_path(7e-3).stat().st_mtime_ns == made
-
-
-@pytest.mark.parametrize("asked", [{"rate": 0}, {"depth": -0.001}])
-def test_what_cannot_be_is_said(asked):
-    with pytest.raises(BagError, match="cannot have"):
-        press_and_slide(**asked)

@@ -14,16 +14,16 @@ from us_sim.errors import BagError
 from us_sim.recording.path import ProbePath, write_path
 
 EPOCH = 1_700_000_000 * 10**9  # ns
+_HOVER = 0.010  # m, height above the skin before and after
 
 
 def press_and_slide(
     rate: float = 60.0,
     duration: float = 10.0,
     depth: float = 0.012,
-    hover: float = 0.010,
     slide: float = 0.008,
 ) -> ProbePath:
-    """A path that touches flat skin at the origin, presses on it and lets go of it.
+    """Make a path that touches flat skin at the origin, presses on it and lets go of it.
 
     Between its key poses it moves with minimum jerk (Flash and Hogan 1985), as a hand does, so it
     rests for an instant at each of them.
@@ -32,20 +32,11 @@ def press_and_slide(
         rate: poses per second.
         duration: s; the phases keep their fractions of it.
         depth: m, of the press below the skin.
-        hover: m, height above the skin before and after.
         slide: m, along y and back; it rocks by 4° for 8 mm, and less for less.
 
     Returns:
         ``round(rate * duration)`` poses on ``/tracker/pose`` in frame ``patient``.
-
-    Raises:
-        BagError: a rate or duration is not positive, or a length negative.
     """
-    if not (rate > 0 and duration > 0 and depth >= 0 and hover >= 0):
-        raise BagError(
-            f"a path cannot have rate {rate}, duration {duration}, depth {depth}, hover {hover}: "
-            f"the first two must be positive, the others not negative"
-        )
     times = np.arange(round(rate * duration)) / rate
     phase = times * (10.0 / duration)
     # Keys: times of a path of ten seconds, and values between which it moves smoothly. A height is
@@ -58,7 +49,7 @@ def press_and_slide(
     half_angle = min(1.0, abs(slide) / 0.008) * np.radians(rock) / 2
     positions = np.zeros((len(times), 3))
     positions[:, 1] = slide * slid
-    positions[:, 2] = press * np.where(press < 0, hover, depth)
+    positions[:, 2] = press * np.where(press < 0, _HOVER, depth)
     orientations = np.zeros((len(times), 4))
     orientations[:, 0] = np.sin(half_angle)
     orientations[:, 3] = np.cos(half_angle)
@@ -67,7 +58,7 @@ def press_and_slide(
 
 
 def _minimum_jerk(keys: list[list[float]], times: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(K,) values at times (K,) s, at rest at each of the keys (N, 2) and outside of them."""
+    """Return (K,) values at times (K,) s, at rest at the keys (N, 2) and outside of them."""
     at, values = np.array(keys).T
     left = np.clip(np.searchsorted(at, times, side="right") - 1, 0, len(at) - 2)
     fraction = np.clip((times - at[left]) / (at[left + 1] - at[left]), 0.0, 1.0)
@@ -76,7 +67,7 @@ def _minimum_jerk(keys: list[list[float]], times: NDArray[np.float64]) -> NDArra
 
 
 def pressing_path(depth: float, slide: float = 0.008) -> Path:
-    """The file of `press_and_slide` with that depth and slide (m), to a tenth of a millimetre.
+    """Return the file of `press_and_slide` with that depth and slide, m, to a tenth of a mm.
 
     Raises:
         BagError: the cache folder cannot be written.
