@@ -28,7 +28,7 @@ from us_sim.nodes.messages import (
 )
 from us_sim.recording.decoding import (
     affine_from,
-    markers_stamp,
+    first_stamp_in,
     mesh_from,
     nanoseconds_of,
     pixels_from,
@@ -206,7 +206,7 @@ def test_structure_markers_are_what_rclpy_would_serialize(surfaces, frame):
     # Not byte for byte: what fills the gaps between numbers is up to the middleware.
     assert len(serialized) == len(serialize_message(expected))
     assert deserialize_message(serialized, MarkerArray) == expected
-    assert markers_stamp(serialized) == (nanoseconds_of(STAMP) if given_ones else None)
+    assert first_stamp_in(serialized) == (nanoseconds_of(STAMP) if given_ones else None)
 
 
 @quick

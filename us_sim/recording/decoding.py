@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,29 @@ def nanoseconds_since(seconds: int, nanoseconds: int) -> int:
     return int(SECOND * seconds + nanoseconds)
 
 
+def stamp_in(data: bytes, begin: int = 4) -> int:
+    """Read the ns since 1970 with which a serialized message's header begins.
+
+    Nothing else of it is decoded: it may hold megabytes.
+
+    Raises:
+        struct.error, IndexError: it is too short to have a stamp.
+    """
+    seconds, nanoseconds = struct.unpack_from(f"{_order_of(data)}iI", data, begin)
+    return int(SECOND * seconds + nanoseconds)
+
+
+def first_stamp_in(data: bytes) -> int | None:
+    """Read the stamp of the first of a serialized sequence of messages; None for an empty one."""
+    (count,) = struct.unpack_from(f"{_order_of(data)}I", data, 4)
+    return stamp_in(data, 8) if count else None
+
+
+def _order_of(data: bytes) -> str:
+    """Return the order of bytes that the encapsulation of a serialized message states."""
+    return "<" if data[1] & 1 else ">"
+
+
 def require_frame(header: Any, frame: str | None) -> None:
     """Check the frame of a message; None is any.
 
@@ -85,7 +109,7 @@ def pose_from(message: Any, frame: str | None = None) -> Pose:
 
 
 def pose_from_text(text: str) -> Pose:
-    """The pose in a text of `pose_text`.
+    """Read the pose in a text of `pose_text`.
 
     Raises:
         PoseError: it is no pose.
@@ -99,7 +123,7 @@ def pose_from_text(text: str) -> Pose:
 
 
 def transform_from(message: Any) -> Pose:
-    """The child's pose in the frame of a transform's header.
+    """Return the child's pose in the frame of a transform's header.
 
     Raises:
         PoseError: as for `pose_from`.
@@ -118,7 +142,7 @@ def _pose(p: Any, q: Any) -> Pose:
 
 
 def wrench_from(message: Any, frame: str | None = None) -> NDArray[np.float64]:
-    """Force and torque (6,) N, N m about the origin of the message's frame.
+    """Return force and torque (6,) N, N m about the origin of the message's frame.
 
     Raises:
         MessageError: a number is not finite.
@@ -129,7 +153,7 @@ def wrench_from(message: Any, frame: str | None = None) -> NDArray[np.float64]:
 
 
 def twist_from(message: Any) -> NDArray[np.float64]:
-    """Linear and angular velocity (6,) m/s, rad/s along the axes of the message's frame.
+    """Return linear and angular velocity (6,) m/s, rad/s along the axes of the message's frame.
 
     Raises:
         MessageError: a number is not finite.
@@ -138,14 +162,15 @@ def twist_from(message: Any) -> NDArray[np.float64]:
 
 
 def _six_numbers(what: str, linear: Any, angular: Any) -> NDArray[np.float64]:
-    numbers = np.array([*_xyz(linear), *_xyz(angular)])
+    numbers = _points([linear, angular]).ravel()
     if not np.isfinite(numbers).all():
         raise MessageError(f"the {what} is not finite: {numbers.tolist()}")
     return numbers
 
 
-def _xyz(vector: Any) -> tuple[float, float, float]:
-    return vector.x, vector.y, vector.z
+def _points(points: Iterable[Any]) -> NDArray[np.float64]:
+    """Return x, y and z (N, 3) of points or vectors."""
+    return np.array([(p.x, p.y, p.z) for p in points], dtype=np.float64).reshape(-1, 3)
 
 
 _KINDS = {7: "f4", 8: "f8"}  # by sensor_msgs/PointField's FLOAT32 and FLOAT64
@@ -154,7 +179,7 @@ _FARTHEST = 1e6
 
 
 def vectors_from(message: Any, frame: str | None = None) -> NDArray[np.float64]:
-    """The x, y, z fields of a cloud, (N, 3) m.
+    """Return the x, y, z fields of a cloud, (N, 3) m.
 
     Args:
         message: of points one after the other.
@@ -193,7 +218,7 @@ def vectors_from(message: Any, frame: str | None = None) -> NDArray[np.float64]:
 
 
 def tetrahedra_from(message: Any) -> NDArray[np.int32]:
-    """(M, 4) node indices.
+    """Return (M, 4) node indices.
 
     Raises:
         MeshError: the number of indices is not a multiple of four, or one is negative.
@@ -207,12 +232,12 @@ def tetrahedra_from(message: Any) -> NDArray[np.int32]:
 
 
 def mesh_from(message: Any) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices (N, 3) m and triangles (T, 3) of a shape.
+    """Return vertices (N, 3) m and triangles (T, 3) of a shape.
 
     Raises:
         MeshError: a vertex is not finite, or a triangle names one that is not there.
     """
-    vertices = np.array([(p.x, p.y, p.z) for p in message.vertices]).reshape(-1, 3)
+    vertices = _points(message.vertices)
     indices = [triangle.vertex_indices for triangle in message.triangles]
     triangles = np.array(indices, dtype=np.int64).reshape(-1, 3)
     if not np.isfinite(vertices).all():
@@ -229,7 +254,7 @@ _LARGEST_OFFSET = 1e6  # m, of a pixel, or to the first one
 
 
 def pixels_from(message: Any, encoding: str = "mono8") -> NDArray[np.uint8]:
-    """The pixels of an image: (rows, columns) of ``mono8``, (rows, columns, 3) of ``rgb8``.
+    """Return the pixels of an image, (rows, columns) of ``mono8``, (rows, columns, 3) of ``rgb8``.
 
     Raises:
         VolumeError: another encoding, no pixels, or fewer bytes than the stated size.
@@ -242,7 +267,7 @@ def pixels_from(message: Any, encoding: str = "mono8") -> NDArray[np.uint8]:
 
 
 def field_from(message: Any) -> NDArray[np.float32]:
-    """The (rows, columns, K) values of a ``32FC…`` image, (rows, columns) where K is 1.
+    """Return (rows, columns, K) values of a ``32FC…`` image, (rows, columns) where K is 1.
 
     Raises:
         VolumeError: another encoding, big-endian values, no pixels, or fewer bytes than the stated
@@ -259,7 +284,7 @@ def field_from(message: Any) -> NDArray[np.float32]:
 
 
 def rows_from(message: Any, size: int) -> NDArray[np.uint8]:
-    """The bytes of an image, row by row, without padding.
+    """Return the bytes of an image, row by row, without padding.
 
     Args:
         message: the image.
@@ -281,7 +306,7 @@ def rows_from(message: Any, size: int) -> NDArray[np.uint8]:
 
 
 def affine_from(message: Any) -> NDArray[np.float64]:
-    """The (4, 4) affine map in a message.
+    """Return the (4, 4) affine map in a message.
 
     Raises:
         ProbeError: it is no 4 by 4 matrix, its last row is not 0 0 0 1, or a number of it is not
@@ -302,12 +327,10 @@ def affine_from(message: Any) -> NDArray[np.float64]:
 
 MarkedTriangles = tuple[str, tuple[float, float, float], NDArray[np.float64]]
 """A marker's namespace, its red, green and blue, and three (3 T, 3) m corners of each triangle."""
-_FIRST_STAMP = 8
-"""Where it is in a serialized array: after the encapsulation and the number of markers."""
 
 
 def triangles_from(message: Any, frame: str) -> list[MarkedTriangles]:
-    """The triangles of each TRIANGLE_LIST that an array adds, those of a namespace together.
+    """Return the triangles of each TRIANGLE_LIST that is added, those of a namespace together.
 
     Raises:
         MeshError: corners do not make whole triangles, or one is not finite.
@@ -330,7 +353,7 @@ def triangles_from(message: Any, frame: str) -> list[MarkedTriangles]:
 
 
 def line_from(message: Any, frame: str) -> NDArray[np.float64]:
-    """(P, 3) m, the points of the first LINE_STRIP that an array adds, without the repeated last.
+    """Return (P, 3) m, the first LINE_STRIP that is added, without the repeated last point.
 
     Raises:
         MeshError: a point is not finite.
@@ -344,23 +367,9 @@ def line_from(message: Any, frame: str) -> NDArray[np.float64]:
     return np.zeros((0, 3))
 
 
-def markers_stamp(data: bytes) -> int | None:
-    """The ns since 1970 at which the first marker of a serialized array is; None where it has none.
-
-    Nothing else of it is decoded: an array may hold megabytes.
-
-    Raises:
-        StampError: it is no time.
-    """
-    order = "<" if data[1:2] == b"\1" else ">"
-    if len(data) < _FIRST_STAMP + 8 or struct.unpack_from(f"{order}I", data, 4)[0] == 0:
-        return None
-    return nanoseconds_since(*struct.unpack_from(f"{order}iI", data, _FIRST_STAMP))
-
-
 def _points_of(marker: Any) -> NDArray[np.float64]:
-    """(P, 3) m, in the marker's frame."""
-    points = np.array([(p.x, p.y, p.z) for p in marker.points], dtype=np.float64)
+    """Return (P, 3) m, in the marker's frame."""
+    points = _points(marker.points)
     if not np.isfinite(points).all():
         raise MeshError(f"{marker.ns}: a point is not finite")
     p, q = marker.pose.position, marker.pose.orientation

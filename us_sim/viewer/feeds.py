@@ -28,8 +28,8 @@ from us_sim.nodes.guarded_node import GuardedNode, Subscriptions
 from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.recording.decoding import (
     affine_from,
+    first_stamp_in,
     line_from,
-    markers_stamp,
     mesh_from,
     nanoseconds_of,
     pixels_from,
@@ -455,7 +455,7 @@ class StructuresFeed:
             self._try()
 
     def _take_structures(self, data: bytes) -> None:
-        stamp = markers_stamp(data)
+        stamp = first_stamp_in(data)
         if stamp is not None:
             self._structures = stamp, data
             self._try()
