@@ -27,6 +27,7 @@ from us_sim.nodes.sessions.recorded_topic import RecordedTopic
 from us_sim.recording.path import ProbePath, write_path
 from us_sim.recording.reader import read_bag
 from us_sim.recording.repair import extract
+from us_sim.recording.topic import DEFAULT_QOS
 from us_sim.recording.writer import BagWriter, PatientFile
 from us_sim.scene.building import path_of
 from us_sim.scene.reading import load_scene
@@ -300,9 +301,9 @@ def test_each_message_of_publishers_of_every_kind_is_recorded_once(bench, tmp_pa
     end(bench, recorder)
     assert sorted(texts(file)) == sorted(said)
     profiles = read_bag(tmp_path).metadata.topics[0].qos
-    assert [(q.reliability, q.durability) for q in profiles] == [
-        ("reliable", "transient_local"),
-        ("best_effort", "volatile"),
+    assert [(q.reliability.name, q.durability.name) for q in profiles] == [
+        ("RELIABLE", "TRANSIENT_LOCAL"),
+        ("BEST_EFFORT", "VOLATILE"),
     ]
 
 
@@ -312,7 +313,7 @@ def test_gaps_in_a_publishers_numbers_are_losses(bench):
         bench.add(GuardedNode("recorder", context=bench.context)),
         "/note",
         "std_msgs/msg/String",
-        [QoSProfile(depth=1)],
+        [DEFAULT_QOS],
         lambda *_: None,
         lambda name, count: lost.append((name, count)),
     )
@@ -321,12 +322,12 @@ def test_gaps_in_a_publishers_numbers_are_losses(bench):
     assert lost == [("/note", 2), ("/note", 7)]
     for number in (1, 21, 2, 22):  # somebody else has begun, of whom the graph does not tell yet
         topic._receive(b"", {"source_timestamp": 0, "publication_sequence_number": number})
-    topic.follow([QoSProfile(depth=1)])  # and has ended again
+    topic.follow([DEFAULT_QOS])  # and has ended again
     for number in (30, 32):
         topic._receive(b"", {"source_timestamp": 0, "publication_sequence_number": number})
     assert lost.pop() == ("/note", 1)
     assert len(lost) == 2
-    topic.follow([QoSProfile(depth=1), QoSProfile(depth=1)])  # whose numbers cannot be told apart
+    topic.follow([DEFAULT_QOS, DEFAULT_QOS])  # whose numbers cannot be told apart
     for number in (30, 1, 31):
         topic._receive(b"", {"source_timestamp": 0, "publication_sequence_number": number})
     assert len(lost) == 2

@@ -11,8 +11,10 @@ import sys
 import time
 from pathlib import Path
 
+from rosbags.interfaces import QosDurability
+
 from us_sim.recording.reader import read_bag
-from us_sim.recording.topic import QosProfile
+from us_sim.recording.topic import DEFAULT_QOS
 from us_sim.recording.writer import BagWriter
 
 EPOCH = 1_700_000_000_000_000_000
@@ -24,8 +26,9 @@ TEXT = bytes.fromhex("00010000 03000000 686900")
 def write(file, frames):
     with BagWriter(file, chunk_size=1 << 30, sidecar=False) as bag:
         for k in range(TOPICS):
-            bag.add_topic(f"/topic_{k}", "std_msgs/msg/String", [QosProfile()])
-        bag.add_topic("/mesh", "std_msgs/msg/String", [QosProfile(durability="transient_local")])
+            bag.add_topic(f"/topic_{k}", "std_msgs/msg/String", [DEFAULT_QOS])
+        latched = DEFAULT_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL)
+        bag.add_topic("/mesh", "std_msgs/msg/String", [latched])
         bag.write("/mesh", TEXT, EPOCH)
         for frame in range(frames):
             at = EPOCH + frame * FRAME

@@ -2,10 +2,11 @@
 
 import pytest
 import yaml
+from rosbags.interfaces import QosDurability, QosHistory, QosReliability, QosTime
 
 from us_sim.errors import BagError
 from us_sim.recording.metadata import read_metadata
-from us_sim.recording.topic import QosProfile, qos_from_yaml, qos_to_yaml
+from us_sim.recording.topic import DEFAULT_QOS, qos_from_yaml, qos_to_yaml
 
 
 def test_real_metadata_is_written_again(shared_data):
@@ -35,14 +36,14 @@ def test_numbers_of_older_bags_are_the_policies_of_rmw():
         "  liveliness_lease_duration:\n    sec: 0\n    nsec: 0\n"
         "  avoid_ros_namespace_conventions: false"
     ) == (
-        QosProfile(
-            history="unknown",
+        DEFAULT_QOS._replace(
+            history=QosHistory.UNKNOWN,
             depth=0,
-            reliability="best_effort",
-            durability="transient_local",
-            deadline=2147483647 * 10**9 + 4294967295,
-            lifespan=10 * 10**9 + 5,
-            liveliness_lease_duration=0,
+            reliability=QosReliability.BEST_EFFORT,
+            durability=QosDurability.TRANSIENT_LOCAL,
+            deadline=QosTime(2147483647, 4294967295),
+            lifespan=QosTime(10, 5),
+            liveliness_lease_duration=QosTime(0, 0),
         ),
     )
 
@@ -64,13 +65,13 @@ def test_refused_metadata(tmp_path, text, word):
         read_metadata(file)
 
 
-DEFAULT = qos_to_yaml([QosProfile()])
+DEFAULT = qos_to_yaml([DEFAULT_QOS])
 
 
 def test_the_default_is_what_a_real_publisher_of_depth_10_was_recorded_with(shared_data):
     real = read_metadata(shared_data / "ros2-jazzy/bags/probe_path_mcap/metadata.yaml")
     (pose,) = (topic for topic in real.topics if topic.name == "/tracker/pose")
-    assert pose.qos == (QosProfile(),)
+    assert pose.qos == (DEFAULT_QOS,)
     assert qos_from_yaml("") == qos_from_yaml("[]") == qos_from_yaml(None) == ()
 
 
@@ -85,4 +86,4 @@ def test_refused_profiles(document):
 
 def test_a_policy_of_a_later_version_is_unknown():
     (read,) = qos_from_yaml(DEFAULT.replace("reliable", "rather"))
-    assert read.reliability == "unknown"
+    assert read.reliability == QosReliability.UNKNOWN

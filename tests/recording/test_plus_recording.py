@@ -53,11 +53,12 @@ def test_a_body_is_led_to_a_reference_by_way_of_the_tracker(tmp_path):
         Pose.from_matrix(recording.transforms[name].matrices[0])
         for name in ("ProbeToTracker", "ReferenceToTracker")
     )
-    for name in ("Probe", "ProbeToTracker"):
-        (matrix,), _ = recording.poses(name, "Reference")
-        np.testing.assert_allclose(matrix, (reference.inverse() @ probe).matrix, atol=1e-12)
-    (back,), _ = recording.poses("Tracker", "Probe")
-    np.testing.assert_allclose(back, probe.inverse().matrix, atol=1e-12)
+    for name, expected in (
+        ("ProbeToReference", reference.inverse() @ probe),
+        ("TrackerToProbe", probe.inverse()),
+    ):
+        found = recording.probe_path(name).pose(0).matrix
+        np.testing.assert_allclose(found, expected.matrix, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -105,9 +106,9 @@ def test_names_that_lead_nowhere_say_which_there_are(tmp_path):
     for call in (
         lambda: recording.probe_path(),
         lambda: recording.probe_path("Needle"),
-        lambda: recording.probe_path("Probe", "Patient"),
+        lambda: recording.probe_path("ProbeToPatient"),
         lambda: recording.probe_path("Tracker"),
-        lambda: recording.probe_path("Probe", "Probe"),
+        lambda: recording.probe_path("ProbeToProbe"),
     ):
         with pytest.raises(TrackingError, match="ProbeToTracker, StylusToTracker"):
             call()
@@ -120,7 +121,7 @@ def test_bodies_whose_names_hold_to_are_read_as_plus_reads_them(tmp_path):
     assert sorted(recording.transforms) == sorted(names)
     for body, reference in (("Torso", "Tracker"), ("TestTool", "Tracker"), ("ToolTip", "Tool")):
         assert recording.probe_path(body).frame_id == reference
-    (tip,), _ = recording.poses("ToolTipToTracker")
+    tip = recording.probe_path("ToolTipToTracker").pose(0).matrix
     tool = recording.transforms["ToolToTracker"].matrices[0]
     np.testing.assert_allclose(tip, tool @ tool, atol=1e-12)
 
@@ -144,7 +145,7 @@ def test_the_invalid_sample_and_the_outlier_of_a_real_recording_are_left_out(rec
         "ProbeToTracker": {"ProbeToTrackerTransformStatus is not OK": 1},
         "ReferenceToTracker": {"an identity among poses that are none": 1},
     }
-    path = recording.probe_path("Probe", "Reference")
+    path = recording.probe_path("ProbeToReference")
     assert (len(path), path.rejected) == (499, 1)
     # Without them the probe only moves by millimetres against the reference.
     assert np.ptp(path.positions, axis=0).max() < 0.02

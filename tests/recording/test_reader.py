@@ -16,7 +16,7 @@ from session_files import EPOCH, HI, STRING
 
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
-from us_sim.recording.topic import QosProfile
+from us_sim.recording.topic import DEFAULT_QOS
 from us_sim.recording.writer import BagWriter
 
 
@@ -209,7 +209,7 @@ def test_a_topic_of_two_types_is_refused(tmp_path):
 
 @pytest.mark.parametrize("offered", [0, 1])
 def test_quality_of_service_that_one_file_of_a_bag_lacks_is_that_of_the_other(tmp_path, offered):
-    quality = (QosProfile(depth=3),)
+    quality = (DEFAULT_QOS._replace(depth=3),)
     for k in range(2):
         with BagWriter(tmp_path / f"bag_{k}.mcap", sidecar=False) as bag:
             bag.add_topic("/note", STRING, quality if k == offered else ())

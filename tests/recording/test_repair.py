@@ -12,7 +12,7 @@ from us_sim.command.main import main
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
 from us_sim.recording.repair import extract, repair
-from us_sim.recording.topic import QosProfile
+from us_sim.recording.topic import DEFAULT_QOS
 from us_sim.recording.writer import BagWriter
 
 
@@ -21,7 +21,7 @@ def session(tmp_path):
     """A recording with three chunks, an attachment, a marker and a loss."""
     file = tmp_path / "session.mcap"
     with BagWriter(file) as bag:
-        bag.add_topic("/note", STRING, [QosProfile(depth=3)])
+        bag.add_topic("/note", STRING, [DEFAULT_QOS._replace(depth=3)])
         bag.attach("scene.yaml", "application/yaml", b"name: arm\n", EPOCH)
         bag.attach("camera.yaml", "application/yaml", b"width: 640\n", EPOCH)
         for k in range(20):
@@ -53,7 +53,7 @@ def test_a_cut_recording_is_made_whole(session, tmp_path):
     assert not whole.note
     assert list(whole.messages()) == list(read_bag(cut).messages())
     assert made.message_count == whole.message_count == 11  # in whole chunks
-    assert whole.topic("/note").qos == (QosProfile(depth=3),)
+    assert whole.topic("/note").qos == (DEFAULT_QOS._replace(depth=3),)
     assert whole.attachments.keys() == {"scene.yaml", "camera.yaml"}
     assert whole.markers() == [(EPOCH + 15 * 10**8, "needle in")]
     assert cut.read_bytes() == content[: len(cut.read_bytes())]  # untouched

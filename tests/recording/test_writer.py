@@ -11,6 +11,7 @@ from mcap.reader import make_reader
 from mcap.records import Metadata
 from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader
 from session_files import EPOCH, HI, STRING, text
 
@@ -18,8 +19,10 @@ from us_sim.errors import BagError
 from us_sim.recording.metadata import read_metadata
 from us_sim.recording.reader import read_bag
 from us_sim.recording.repair import repair
-from us_sim.recording.topic import QosProfile
+from us_sim.recording.topic import DEFAULT_QOS
 from us_sim.recording.writer import BagWriter
+
+WEAK = DEFAULT_QOS._replace(reliability=QosReliability.BEST_EFFORT)
 
 
 def write_all(bag, messages):
@@ -71,10 +74,10 @@ def test_a_real_bag_written_again_is_the_same_bag(shared_data, tmp_path, name):
 @pytest.mark.parametrize("compression", ["none", "zstd"])
 def test_rosbags_and_mcap_read_what_was_written(tmp_path, compression):
     file = tmp_path / "session.mcap"
-    latched = QosProfile(depth=1, durability="transient_local")
+    latched = DEFAULT_QOS._replace(depth=1, durability=QosDurability.TRANSIENT_LOCAL)
     with BagWriter(file, compression=compression, chunk_size=400) as bag:
-        bag.add_topic("/a", STRING, [QosProfile()])
-        bag.add_topic("/b", STRING, [latched, QosProfile(reliability="best_effort")])
+        bag.add_topic("/a", STRING, [DEFAULT_QOS])
+        bag.add_topic("/b", STRING, [latched, WEAK])
         bag.add_topic("/silent", "geometry_msgs/msg/PoseStamped")
         for k in range(300):
             topic = "/a" if k % 3 else "/b"
@@ -239,15 +242,13 @@ def test_a_further_file_is_the_next_that_is_free(tmp_path):
 
 
 def test_a_topic_may_be_added_again_but_not_change_its_type(tmp_path):
-    weak = QosProfile(reliability="best_effort")
     with BagWriter(tmp_path / "bag.mcap") as bag:
-        bag.add_topic("/note", STRING, [QosProfile()])
-        bag.add_topic("/note", STRING, [QosProfile(), weak])
-        assert bag.topics == ("/note",)
+        bag.add_topic("/note", STRING, [DEFAULT_QOS])
+        bag.add_topic("/note", STRING, [DEFAULT_QOS, WEAK])
         with pytest.raises(BagError, match=STRING):
             bag.add_topic("/note", "geometry_msgs/msg/PoseStamped")
     # Quality of service that is offered later is in the metadata, too.
-    assert read_bag(tmp_path).metadata.topics[0].qos == (QosProfile(), weak)
+    assert read_bag(tmp_path).metadata.topics[0].qos == (DEFAULT_QOS, WEAK)
 
 
 @pytest.mark.parametrize("take_away", [Path.unlink, lambda file: file.rename(file.with_name("k"))])

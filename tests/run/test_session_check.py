@@ -4,6 +4,7 @@ import re
 import struct
 
 import pytest
+from rosbags.interfaces import QosDurability
 from session_files import EPOCH, PERIOD, TYPES, press, write
 
 from us_sim.command.main import main
@@ -11,7 +12,7 @@ from us_sim.recording.reader import read_bag
 from us_sim.recording.repair import repair
 from us_sim.recording.schemas import stamped
 from us_sim.recording.stamps import stamp_reader
-from us_sim.recording.topic import QosProfile
+from us_sim.recording.topic import DEFAULT_QOS
 from us_sim.recording.writer import BagWriter
 from us_sim.run.session_check import check
 
@@ -244,7 +245,7 @@ def test_a_folder_that_holds_more_than_its_metadata_says(tmp_path):
 
 
 def test_latched_messages_have_no_age_and_no_rate(tmp_path):
-    latched = QosProfile(durability="transient_local", depth=1)
+    latched = DEFAULT_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL, depth=1)
     with BagWriter(tmp_path / "s.mcap", sidecar=False) as bag:
         for topic, kind in TYPES.items():
             bag.add_topic(topic, kind, [latched])

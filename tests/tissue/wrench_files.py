@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.recording.schemas import jazzy_definitions, stamped
-from us_sim.recording.topic import QosProfile
+from us_sim.recording.topic import DEFAULT_QOS
 from us_sim.recording.writer import BagWriter
 
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
@@ -32,7 +32,7 @@ def write_wrenches(file: str | Path | BagWriter, record: WrenchRecord) -> None:
         with BagWriter(file, compression="zstd") as writer:
             write_wrenches(writer, record)
         return
-    file.add_topic(record.topic, WRENCH_STAMPED, [QosProfile()])
+    file.add_topic(record.topic, WRENCH_STAMPED, [DEFAULT_QOS])
     types = jazzy_definitions().types
     vector = types["geometry_msgs/msg/Vector3"]
     for stamp, wrench in zip(record.stamps.tolist(), record.wrenches.tolist(), strict=True):

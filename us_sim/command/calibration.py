@@ -51,7 +51,6 @@ from us_sim.tracking.calibration.transform_file import (
 )
 from us_sim.tracking.camera.model import write_camera_info
 from us_sim.tracking.camera.rigid_body import read_rigid_body
-from us_sim.volume.sequences.transforms import split_transform_name
 
 
 def read_motion(path: Path, name: str | None) -> ProbePath:
@@ -77,10 +76,7 @@ def read_motion(path: Path, name: str | None) -> ProbePath:
                 f"{', '.join(recording.transforms)}, or one such as StylusToReference"
             )
         name = bodies[0]
-    if name in recording.transforms:
-        return recording.probe_path(name)
-    body, reference = split_transform_name(name) or (name, None)
-    return recording.probe_path(body, reference)
+    return recording.probe_path(name)
 
 
 def read_signal(path: Path, name: str | None) -> PositionSignal:

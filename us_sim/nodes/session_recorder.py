@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.type_support import check_for_type_support
+from rosbags.interfaces import Qos
 from std_msgs.msg import String
 
 from us_sim.errors import BagError
@@ -27,7 +27,7 @@ from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
 from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.nodes.topics import MARKERS, TOPICS
 from us_sim.recording.schemas import normalized_type, type_hash
-from us_sim.recording.topic import MARKER
+from us_sim.recording.topic import MARKER, qos_of
 from us_sim.recording.write_behind import WriteBehind
 from us_sim.recording.writer import BagWriter
 from us_sim.settings.spelling import counted
@@ -176,10 +176,10 @@ class SessionRecorder(GuardedNode):
             self._bag.add_topic(topic, type_name, offered)
         self._topics[topic] = recorded
 
-    def _offered(self, topic: str, type_name: str) -> list[QoSProfile]:
+    def _offered(self, topic: str, type_name: str) -> list[Qos]:
         """Quality of service of the topic's publishers of that type."""
         publishers = self.get_publishers_info_by_topic(topic)
-        return [each.qos_profile for each in publishers if each.topic_type == type_name]
+        return [qos_of(each.qos_profile) for each in publishers if each.topic_type == type_name]
 
     def _take(self, topic: str, data: bytes, info: Mapping[str, Any]) -> None:
         self.health.received += 1

@@ -121,5 +121,5 @@ def _feature(
 
 
 def _rgb(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(rows, columns, 3), since lerobot and its policies know no others."""
+    """Return (rows, columns, 3), since lerobot and its policies know no others."""
     return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)

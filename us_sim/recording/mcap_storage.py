@@ -88,7 +88,7 @@ class McapStorage:
     def messages(
         self, topics: Collection[str], damage: list[Fault] | None, since: int | None = None
     ) -> Iterator[BagMessage]:
-        """The messages of these topics in the order of their log times.
+        """Yield the messages of these topics in the order of their log times.
 
         Args:
             topics: their names.
@@ -143,15 +143,13 @@ class McapStorage:
             summary = make_reader(stream).get_summary()
         except _DAMAGE:
             return False
-        besides: tuple[Any, ...] = ()
-        if summary is not None:
-            besides = (*summary.attachment_indexes, *summary.metadata_indexes)
+        if summary is None or summary.statistics is None:
+            return False
+        said = summary.statistics
+        besides: list[Any] = [*summary.attachment_indexes, *summary.metadata_indexes]
         records = {each.offset: _record_at(stream, each.offset, each.length) for each in besides}
-        said = summary.statistics if summary else None
         if (
-            summary is None
-            or said is None
-            or len(summary.chunk_indexes) != said.chunk_count
+            len(summary.chunk_indexes) != said.chunk_count
             or (said.message_count and not said.chunk_count)
             or not summary.channels.keys() >= said.channel_message_counts.keys()
             or not {record[:1] for record in records.values()} <= _BESIDES
@@ -258,7 +256,7 @@ def _parsed(kind: Any, content: memoryview) -> Any:
 
 
 def _records_in(record: bytes) -> Iterator[tuple[int, memoryview]]:
-    """Opcode and content of each record in a chunk; of another record, its own.
+    """Yield opcode and content of each record in a chunk; of another record, its own.
 
     Raises:
         _DAMAGE: it is not sound.
@@ -285,7 +283,7 @@ def _records_in(record: bytes) -> Iterator[tuple[int, memoryview]]:
 def _messages(
     stream: BinaryIO, run: _Run, wanted: dict[int, tuple[str, str]]
 ) -> Iterator[_Ordered]:
-    """The messages of a run on channels of which name and type are given.
+    """Yield the messages of a run on channels of which name and type are given.
 
     Raises:
         _DAMAGE: it is not sound.

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rosbags.rosbag2.metadata import dump_qos_v9
+
 from us_sim.errors import BagError
 from us_sim.recording.schemas import normalized_type
 from us_sim.recording.topic import BagTopic, as_yaml, qos_from_yaml
@@ -15,7 +17,7 @@ from us_sim.settings.text_files import YamlError, load_yaml
 
 _KEY = "rosbag2_bagfile_information"
 _NEWEST_VERSION = 9
-_NO_TIME = 2**63 - 1  # ns, the starting time that rosbag2 gives a bag without messages
+NO_TIME = 2**63 - 1  # ns, the starting time that rosbag2 gives a bag without messages
 
 
 @dataclass(frozen=True)
@@ -24,17 +26,17 @@ class BagMetadata:
 
     files: tuple[str, ...]  # relative to the bag's folder
     topics: tuple[BagTopic, ...] = ()
-    start: int = _NO_TIME  # ns since the epoch, lowest log time
+    start: int = NO_TIME  # ns since the epoch, lowest log time
     duration: int = 0  # ns
     message_count: int = 0
     compression_mode: str = ""  # "", "FILE" or "MESSAGE"
 
     def document(self) -> str:
-        """The text of the file, for a bag of one MCAP file."""
+        """Return the text of the file, for a bag of one MCAP file."""
         return as_yaml({_KEY: self.information()})
 
     def information(self) -> dict[str, Any]:
-        """What rosbag2 also stores inside an MCAP file, without the outer key."""
+        """Return what rosbag2 also stores inside an MCAP file, without the outer key."""
         extent = {
             "starting_time": {"nanoseconds_since_epoch": self.start},
             "duration": {"nanoseconds": self.duration},
@@ -50,7 +52,7 @@ class BagMetadata:
                         "name": topic.name,
                         "type": topic.type_name,
                         "serialization_format": topic.encoding,
-                        "offered_qos_profiles": [profile.document() for profile in topic.qos],
+                        "offered_qos_profiles": dump_qos_v9([*topic.qos]),
                         "type_description_hash": topic.type_hash,
                     },
                     "message_count": topic.message_count,
@@ -67,7 +69,7 @@ class BagMetadata:
 
 
 def read_metadata(file: Path) -> BagMetadata:
-    """Reads a ``metadata.yaml`` of any version up to 9.
+    """Read a ``metadata.yaml`` of any version up to 9.
 
     Raises:
         BagError: it cannot be read, is not such a file, or is of a newer version.

@@ -33,13 +33,11 @@ from us_sim.geometry.frame_chain import FrameChain
 from us_sim.geometry.pose import Pose
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.schemas import jazzy_definitions, stamped
-from us_sim.recording.storage import NoBagError
-from us_sim.recording.topic import BagTopic, QosProfile
+from us_sim.recording.topic import DEFAULT_QOS, BagTopic
 from us_sim.recording.writer import BagWriter
 from us_sim.volume.sequences.sequence import SEQUENCE_SUFFIXES, read_sequence
 from us_sim.volume.sequences.transforms import (
     FrameTransforms,
-    TransformChain,
     along,
     is_image_frame,
     shortest_chain,
@@ -75,41 +73,18 @@ class ProbePath:
         return len(self.stamps)
 
     def pose(self, index: int) -> Pose:
-        """The pose at a place in the path, its quaternion normalised."""
+        """Return the pose at a place in the path, its quaternion normalised."""
         return Pose(self.positions[index], self.orientations[index])
 
     @property
     def poses(self) -> list[Pose]:
-        """All poses, as `pose` returns them."""
+        """Return all poses, as `pose` returns them."""
         return [self.pose(index) for index in range(len(self))]
 
     @property
     def duration(self) -> float:
-        """Seconds from the first to the last recorded pose."""
+        """Return the seconds from the first to the last recorded pose."""
         return float(self.log_times[-1] - self.log_times[0]) / 1e9 if len(self) else 0.0
-
-
-_Found = tuple[str, Any, Any, Any]  # a body's name, header, position, orientation
-
-
-def _within(message: Any) -> list[_Found]:
-    return [("", message.header, message.pose.pose.position, message.pose.pose.orientation)]
-
-
-def _transform(message: Any, body: str = "") -> _Found:
-    return body, message.header, message.transform.translation, message.transform.rotation
-
-
-_POSES: Mapping[str, Callable[[Any], list[_Found]]] = {
-    POSE_STAMPED: lambda m: [("", m.header, m.pose.position, m.pose.orientation)],
-    "geometry_msgs/msg/PoseWithCovarianceStamped": _within,
-    "nav_msgs/msg/Odometry": _within,
-    "geometry_msgs/msg/TransformStamped": lambda m: [_transform(m)],
-    _POSE_ARRAY: lambda m: [
-        (str(k), m.header, pose.position, pose.orientation) for k, pose in enumerate(m.poses)
-    ],
-    _TF: lambda m: [_transform(each, each.child_frame_id.lstrip("/")) for each in m.transforms],
-}
 
 
 class Row(NamedTuple):
@@ -121,8 +96,31 @@ class Row(NamedTuple):
     pose: tuple[float, ...]  # x, y, z (m), quaternion x, y, z, w; nan where there is none
 
 
+_Found = tuple[str, Any, Any, Any]  # a body's name, header, position, orientation
+
+
+def _single(header: Any, pose: Any) -> list[_Found]:
+    return [("", header, pose.position, pose.orientation)]
+
+
+def _transform(message: Any, body: str = "") -> _Found:
+    return body, message.header, message.transform.translation, message.transform.rotation
+
+
+_POSES: Mapping[str, Callable[[Any], list[_Found]]] = {
+    POSE_STAMPED: lambda m: _single(m.header, m.pose),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: _single(m.header, m.pose.pose),
+    "nav_msgs/msg/Odometry": lambda m: _single(m.header, m.pose.pose),
+    "geometry_msgs/msg/TransformStamped": lambda m: [_transform(m)],
+    _POSE_ARRAY: lambda m: [
+        (str(k), m.header, pose.position, pose.orientation) for k, pose in enumerate(m.poses)
+    ],
+    _TF: lambda m: [_transform(each, each.child_frame_id.lstrip("/")) for each in m.transforms],
+}
+
+
 def bodies_in(bag: Bag) -> dict[str, list[str]]:
-    """Names of the bodies whose poses a bag holds, by the types of their messages.
+    """Return the names of the bodies whose poses a bag holds, by the types of their messages.
 
     Raises:
         BagError: a message cannot be read.
@@ -133,13 +131,13 @@ def bodies_in(bag: Bag) -> dict[str, list[str]]:
             continue
         names = {topic.name: None}
         if topic.type_name in (_POSE_ARRAY, _TF):
-            names = {f"{topic.name}:{each[0]}": None for _, each in _each(bag, topic)}
+            names = {f"{topic.name}:{body}": None for body, _ in _each(bag, topic)}
         found.setdefault(topic.type_name, []).extend(names)
     return found
 
 
 def pose_rows(bag: Bag, name: str) -> Iterator[Row]:
-    """The poses of a body, in the order in which they were recorded.
+    """Yield the poses of a body, in the order in which they were recorded.
 
     The leading slash of its name may be left away.
 
@@ -158,7 +156,7 @@ def pose_rows(bag: Bag, name: str) -> Iterator[Row]:
         yield from _chained(bag, topic, body, parent)
         return
     found: dict[str, None] = {}
-    for row, (other, *_) in _each(bag, topic):
+    for other, row in _each(bag, topic):
         found[other] = None
         if other == body:
             yield row
@@ -167,27 +165,26 @@ def pose_rows(bag: Bag, name: str) -> Iterator[Row]:
         raise BagError(f"{bag.path} has no {name}; it has {names}")
 
 
-def _each(bag: Bag, topic: BagTopic) -> Iterator[tuple[Row, _Found]]:
-    """Every pose of a topic's messages, with the body that it is of."""
+def _each(bag: Bag, topic: BagTopic) -> Iterator[tuple[str, Row]]:
+    """Yield every pose of a topic's messages, after the body that it is of."""
     poses = _POSES[topic.type_name]
     for raw in bag.messages([topic.name]):
         message = bag.deserialize(raw)
         try:
-            for found in poses(message):
-                _, header, p, q = found
+            for body, header, p, q in poses(message):
                 stamp = header.stamp.sec * 10**9 + header.stamp.nanosec
                 pose = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
-                yield Row(raw.log_time, stamp, header.frame_id, pose), found
+                yield body, Row(raw.log_time, stamp, header.frame_id, pose)
         except (AttributeError, TypeError) as error:  # the bag's own definitions are damaged
             raise BagError(f"{bag.path}: no {topic.type_name} of ROS 2: {error}") from None
 
 
 def _chained(bag: Bag, topic: BagTopic, body: str, parent: str) -> Iterator[Row]:
-    """The poses of a frame of tf in one further up, made as `FrameChain` makes them live."""
+    """Yield the poses of a frame of tf in one further up, as `FrameChain` makes them live."""
     chain, is_empty = FrameChain(body, parent), True
     static = f"{topic.name}_static"
     for name in [each.name for each in bag.topics if each.name == static] + [topic.name]:
-        for row, (frame, *_) in _each(bag, bag.topic(name)):
+        for frame, row in _each(bag, bag.topic(name)):
             numbers = np.array(row.pose)
             if not is_pose(numbers[None])[0]:
                 continue
@@ -204,12 +201,11 @@ def _chained(bag: Bag, topic: BagTopic, body: str, parent: str) -> Iterator[Row]
         )
 
 
-_PATHS = "give a bag (.mcap, .db3) or a tracker recording of PLUS (.igs.mha, .igs.nrrd)"
 _MOST_NAMES = 20  # bodies that are listed where one has to be named
 
 
 def read_path(path: str | Path, topic: str | None = None, *, option: str = "topic") -> ProbePath:
-    """Reads the poses of a bag, or of a tracker recording of Plus (``.mha``, ``.nrrd``).
+    """Read the poses of a bag, or of a tracker recording of Plus (``.mha``, ``.nrrd``).
 
     Poses that are not finite or have no orientation are left out and counted.
 
@@ -228,10 +224,7 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
     """
     if is_tracker_recording(path):
         return read_tracker_recording(path).probe_path(topic, option=option)
-    try:
-        bag = read_bag(path)
-    except NoBagError as error:
-        raise BagError(f"{error}; {_PATHS}") from None
+    bag = read_bag(path)
     name = whole_name(bag, topic or _only_body(bag, option))
     rows = list(pose_rows(bag, name))
     if topic is None and len(_frames(rows)) > 1:  # a hand and a device took turns
@@ -243,12 +236,12 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
 
 
 def is_tracker_recording(path: str | Path) -> bool:
-    """Whether a file's name is that of a sequence of Plus or 3D Slicer."""
+    """Return whether a file's name is that of a sequence of Plus or 3D Slicer."""
     return Path(path).suffix.lower() in SEQUENCE_SUFFIXES
 
 
 def write_path(file: str | Path, path: ProbePath, *, sidecar: bool = True) -> None:
-    """Writes a path as a bag of its one topic, compressed; ``sidecar`` is as for `BagWriter`.
+    """Write a path as a bag of its one topic, compressed; ``sidecar`` is as for `BagWriter`.
 
     Raises:
         BagError: the file exists or cannot be written.
@@ -258,12 +251,12 @@ def write_path(file: str | Path, path: ProbePath, *, sidecar: bool = True) -> No
 
 
 def write_poses(writer: BagWriter, path: ProbePath) -> None:
-    """Writes a path into a bag that is open, as one of its topics: reliable, keep last 10.
+    """Write a path into a bag that is open, as one of its topics: reliable, keep last 10.
 
     Raises:
         BagError: it cannot be written.
     """
-    writer.add_topic(path.topic, POSE_STAMPED, [QosProfile()])
+    writer.add_topic(path.topic, POSE_STAMPED, [DEFAULT_QOS])
     types = jazzy_definitions().types
     rows = zip(path.stamps, path.log_times, path.positions, path.orientations, strict=True)
     for stamp, log_time, position, orientation in rows:
@@ -276,7 +269,7 @@ def write_poses(writer: BagWriter, path: ProbePath) -> None:
 
 
 def _only_body(bag: Bag, option: str) -> str:
-    """The bag's only topic of PoseStamped, a session's tracker poses, or the only other body."""
+    """Return the only topic of PoseStamped, a session's tracker poses, or the only other body."""
     stamped = [topic.name for topic in bag.topics if topic.type_name == POSE_STAMPED]
     tracked = [name for name in stamped if name.endswith("/tracker/pose")]
     others = [] if stamped else [name for names in bodies_in(bag).values() for name in names]
@@ -298,7 +291,7 @@ def _only_body(bag: Bag, option: str) -> str:
 
 
 def is_pose(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(K,) whether each of (K, 7) is finite and has an orientation, as `Pose` asks for.
+    """Return (K,) whether each of (K, 7) is finite and has an orientation, as `Pose` asks for.
 
     Trackers send a zero quaternion for a lost marker.
     """
@@ -308,7 +301,7 @@ def is_pose(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def whole_name(bag: Bag, name: str) -> str:
-    """A topic's or body's name with its leading slash, where the bag has one."""
+    """Return a topic's or body's name with its leading slash, where the bag has one."""
     topic, colon, body = name.partition(":")
     return bag.topic(topic).name + colon + body
 
@@ -318,7 +311,7 @@ def _frames(rows: list[Row]) -> list[str]:
 
 
 def _usable(bag: Bag, name: str, rows: list[Row]) -> ProbePath:
-    """The poses of one frame that can be used."""
+    """Return the poses of one frame that can be used."""
     if not rows:
         raise BagError(f"{bag.path} holds no pose on {name}; {bag.note or 'it is silent'}")
     frames = _frames(rows)
@@ -364,69 +357,46 @@ class TrackerRecording:
         return len(self.times)
 
     def left_out(self, name: str) -> dict[str, int]:
-        """How many samples of a transform are not valid, by reason."""
+        """Count the samples of a transform that are not valid, by reason."""
         return dict(Counter(fault for fault in self.transforms[name].faults if fault))
 
-    def chain(self, name: str, reference: str | None = None) -> TransformChain:
-        """The chain of the fewest transforms from a body to a reference frame.
+    def probe_path(self, name: str | None = None, option: str = "topic") -> ProbePath:
+        """Return the valid poses of a body as a path, by the recorder's clock.
 
         Args:
             name: of a transform (``StylusToTracker``), also one that others make up
-                (``StylusToReference``), or of a body (``Stylus``).
-            reference: a frame (``Reference``); by default that of the body's own transform.
+                (``StylusToReference``), or of a body (``Stylus``), whose own transform is meant;
+                None is the recording's only transform.
+            option: what names it, for the sentence on several.
 
         Raises:
-            TrackingError: the recording has no such transform, or no chain to the reference.
+            TrackingError: the recording has no such transform, the name is missing, or no pose is
+                valid.
         """
-        body, end = split_transform_name(name) or (name, None)
-        if reference is None:
-            frames = filter(None, map(split_transform_name, self.transforms))
-            ends = [end] if end else [top for start, top in frames if start == body]
-            reference = ends[0] if len(ends) == 1 else None
-        chain = shortest_chain(self.transforms, body, reference) if reference else None
-        if chain is None:
-            raise TrackingError(
-                f"{self.path}: no transform or several lead from {name} to {reference or 'a frame'}"
-                f"; its transforms are {', '.join(self.transforms)}"
-            )
-        return chain
-
-    def poses(
-        self, name: str, reference: str | None = None
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """A body's poses in a reference frame (K, 4, 4) m, and which are valid (K,); nan elsewhere.
-
-        Arguments and errors are those of :meth:`chain`.
-        """
-        found = along(self.transforms, self.chain(name, reference))
-        return found.matrices, found.valid
-
-    def probe_path(
-        self, name: str | None = None, reference: str | None = None, option: str = "topic"
-    ) -> ProbePath:
-        """The valid poses of a body as a path in the reference's frame, by the recorder's clock.
-
-        Arguments are as for :meth:`chain`; without a name it is the recording's only transform, and
-        ``option`` is what names it.
-
-        Raises:
-            TrackingError: see :meth:`chain`; or the name is missing, or no pose is valid.
-        """
+        names = ", ".join(self.transforms)
         if name is None:
             if len(self.transforms) != 1:
-                names = ", ".join(self.transforms)
                 raise TrackingError(
                     f"{self.path}: has several transforms: name one by {option}, of {names}"
                 )
             (name,) = self.transforms
-        chain = self.chain(name, reference)
-        matrices, valid = self.poses(name, reference)
+        body, end = split_transform_name(name) or (name, None)
+        frames = filter(None, map(split_transform_name, self.transforms))
+        ends = [end] if end else [top for start, top in frames if start == body]
+        chain = shortest_chain(self.transforms, body, ends[0]) if len(ends) == 1 else None
+        if chain is None:
+            raise TrackingError(
+                f"{self.path}: no transform or several lead from {name} to {end or 'a frame'}; its "
+                f"transforms are {names}"
+            )
+        found = along(self.transforms, chain)
+        valid = found.valid
         why = self.why(key for key, _ in chain.steps)
         if not valid.any():
             raise TrackingError(
                 f"{self.path}: none of the {len(self)} poses of {name} is valid{why}"
             )
-        poses = [Pose.from_matrix(matrix) for matrix in matrices[valid]]
+        poses = [Pose.from_matrix(matrix) for matrix in found.matrices[valid]]
         rejected = self.untimed + int((~valid).sum())
         count = self.untimed + len(self)
         return ProbePath(
@@ -440,7 +410,7 @@ class TrackerRecording:
         )
 
     def why(self, names: Iterable[str]) -> str:
-        """The samples of these transforms that were left out, in brackets, or an empty text."""
+        """Say in brackets which samples of these transforms were left out; nothing if none were."""
         said = [
             f"{count} with {reason}"
             for name in names
@@ -452,7 +422,7 @@ class TrackerRecording:
 
 
 def read_tracker_recording(path: str | Path) -> TrackerRecording:
-    """The transforms of a sequence file of Plus.
+    """Read the transforms of a sequence file of Plus.
 
     A transform whose status is not OK, or that is not rigid (Plus writes zeros for a tool
     that it has not seen), is not valid; a sample without a time is left out whole. Both are
@@ -489,7 +459,7 @@ def read_tracker_recording(path: str | Path) -> TrackerRecording:
 
 
 def _rigid(series: FrameTransforms, which: NDArray[np.intp]) -> FrameTransforms:
-    """Some frames' transforms with the rotations nearest to those that trackers round.
+    """Return some frames' transforms with the rotations nearest to those that trackers round.
 
     What scales, shears or mirrors is not valid.
     """

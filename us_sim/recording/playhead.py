@@ -27,11 +27,11 @@ class Playhead:
         self._since = 0  # at this time of the clock
 
     def position(self, now: int) -> int:
-        """How far after the recording's start it is."""
+        """Return how far after the recording's start it is."""
         return self._at if self.is_paused else self._at + round((now - self._since) * self.rate)
 
     def begun(self, now: int) -> int:
-        """When it would have been at the start, had it always gone at this rate."""
+        """Return when it would have been at the start, had it always gone at this rate."""
         return now - round(self.position(now) / self.rate)
 
     def go_to(self, position: int, now: int) -> None:

@@ -18,12 +18,13 @@ import heapq
 from collections import Counter, defaultdict, deque
 from collections.abc import Collection, Iterator
 from dataclasses import replace
-from datetime import UTC, datetime
 from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import zstandard
+from rosbags.interfaces import Qos
 from rosbags.typesys.store import Typestore
 
 from us_sim.errors import BagError, printable
@@ -76,12 +77,12 @@ class Bag:
 
     @property
     def note(self) -> str:
-        """The faults that were found when the bag was opened; empty when there are none."""
+        """Return the faults that were found when the bag was opened; empty when there are none."""
         return "; ".join(fault.text for fault in self.opening_faults)
 
     @property
     def opening_faults(self) -> list[Fault]:
-        """The faults that were found when the bag was opened."""
+        """Return the faults that were found when the bag was opened."""
         found = [fault for storage in self._storages for fault in storage.faults]
         found += self.damaged_attachments
         if self.metadata is not None:
@@ -99,7 +100,7 @@ class Bag:
         return found
 
     def all_messages(self, faults: list[Fault]) -> Iterator[BagMessage]:
-        """Every message that can be read; ``faults`` takes everything that is wrong."""
+        """Yield every message that can be read; ``faults`` takes everything that is wrong."""
         faults += self.opening_faults
         try:
             yield from self.messages(damage=faults)
@@ -107,7 +108,7 @@ class Bag:
             faults.append(Fault(str(error)))
 
     def topic(self, name: str) -> BagTopic:
-        """The topic of this name, with or without its leading slash.
+        """Return the topic of this name, with or without its leading slash.
 
         Raises:
             BagError: the bag has no such topic.
@@ -120,12 +121,12 @@ class Bag:
         )
 
     def markers(self) -> list[tuple[int, str]]:
-        """The moments that a person marked: ns since the epoch, and the text."""
+        """Return the moments that a person marked: ns since the epoch, and the text."""
         marked = [note.metadata for note in self.notes if note.name == MARKER]
         return [(_count(values.get("time", "")), values.get("text", "")) for values in marked]
 
     def lost(self) -> Counter[str]:
-        """How many messages the recorder says that it lost, by topic."""
+        """Count the messages that the recorder says that it lost, by topic."""
         lost: Counter[str] = Counter()
         for note in self.notes:
             if note.name == LOST:
@@ -138,7 +139,7 @@ class Bag:
         damage: list[Fault] | None = None,
         since: int | None = None,
     ) -> Iterator[BagMessage]:
-        """The messages of all topics or of these, in the order of their log times.
+        """Yield the messages of all topics or of these, in the order of their log times.
 
         Args:
             topics: their names; None for all.
@@ -161,7 +162,7 @@ class Bag:
             damage.append(Fault(f"{text}, which no metadata.yaml says"))
 
     def latest(self, topics: Collection[str], before: int, count: int = 1) -> list[BagMessage]:
-        """The last messages of each of these topics before a time, in the order of log times.
+        """Return the last messages of each topic before a time, in the order of log times.
 
         Args:
             topics: their names.
@@ -177,7 +178,7 @@ class Bag:
         return sorted(chain(*last.values()), key=lambda message: message.log_time)
 
     def _unpacked(self, message: BagMessage) -> BagMessage:
-        """The message, decompressed where each one is compressed by itself.
+        """Return the message, decompressed where each one is compressed by itself.
 
         Without metadata.yaml a frame of zstd is known by its first bytes: no CDR has them.
         """
@@ -194,7 +195,7 @@ class Bag:
         return message._replace(data=data)
 
     def deserialize(self, message: BagMessage) -> Any:
-        """The message as a rosbags dataclass, by the definition that the bag carries.
+        """Return the message as a rosbags dataclass, by the definition that the bag carries.
 
         Raises:
             BagError: it is not CDR, its type is unknown, or its bytes do not fit the type.
@@ -215,7 +216,7 @@ class Bag:
             ) from None
 
     def definitions(self, topic: BagTopic) -> Typestore:
-        """The definition of a topic's type: the bag's own, else that of Jazzy.
+        """Return the definition of a topic's type: the bag's own, else that of Jazzy.
 
         Raises:
             BagError: it cannot be understood, or there is none.
@@ -235,12 +236,12 @@ class Bag:
 
 
 def _count(text: str) -> int:
-    """A number that a note holds; 0 for any other text."""
+    """Return the number that a note holds; 0 for any other text."""
     return int(text) if text.isascii() and text.isdecimal() and len(text) < 20 else 0
 
 
 def read_bag(path: str | Path, *further: Path) -> Bag:
-    """Opens a bag for reading.
+    """Open a bag for reading.
 
     Args:
         path: an MCAP or SQLite file, either of them compressed with zstd, or a folder with such
@@ -259,7 +260,7 @@ def read_bag(path: str | Path, *further: Path) -> Bag:
 
 
 def describe(bag: Bag) -> str:
-    """Path, times, topics with type, count, rate and offered quality; then losses, marks, files.
+    """Tell path, times, topics with their rates and offered quality, then losses, marks, files.
 
     The times of marks are those since the start. All of the bag is read, for its faults.
     """
@@ -272,14 +273,14 @@ def describe(bag: Bag) -> str:
     lines = [f"file      {bag.path}"]
     lines += [f"note      {fault.text}" for fault in faults]
     if start is not None:
-        lines.append(f"start     {_date(start)}")
+        lines.append(f"start     {np.datetime64(start, 'ns').astype('datetime64[ms]')}+00:00")
     lines += [f"duration  {seconds:.3f} s", f"messages  {bag.message_count}", ""]
     table = [("topic", "type", "count", "Hz", "quality of service")]
     for topic in sorted(bag.topics, key=lambda topic: topic.name):
         count = topic.message_count
         first, last = times.get(topic.name, (0, 0))
         rate = f"{(count - 1) / (last - first) * 1e9:.1f}" if last > first else "-"
-        quality = "; ".join(dict.fromkeys(profile.summary for profile in topic.qos)) or "-"
+        quality = "; ".join(dict.fromkeys(map(_summary, topic.qos))) or "-"
         encoding = "" if topic.encoding == "cdr" else f" ({topic.encoding})"
         table.append((topic.name, topic.type_name + encoding, str(count), rate, quality))
     lines += aligned(table, left=(0, 1, 4))
@@ -291,15 +292,14 @@ def describe(bag: Bag) -> str:
     return "\n".join(printable(line) for line in lines)
 
 
+def _summary(qos: Qos) -> str:
+    """Write the first four policies of a profile."""
+    return (
+        f"history: {qos.history.name} depth: {qos.depth} reliability: {qos.reliability.name} "
+        f"durability: {qos.durability.name}"
+    ).lower()
+
+
 def _section(title: str, entries: list[str]) -> list[str]:
-    """Lines under a title, or none."""
+    """Return lines under a title, or none."""
     return ["", title, *(f"  {entry}" for entry in entries)] if entries else []
-
-
-def _date(nanoseconds: int) -> str:
-    """A time since the epoch as a person reads it; as it is where no calendar has it."""
-    try:
-        date = datetime.fromtimestamp(nanoseconds * 1e-9, tz=UTC)
-    except (ValueError, OverflowError, OSError):
-        return f"{nanoseconds} ns"
-    return date.isoformat(timespec="milliseconds")

@@ -13,12 +13,12 @@ from typing import BinaryIO
 
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
-from us_sim.recording.topic import BagTopic, Fault
+from us_sim.recording.topic import Fault
 from us_sim.recording.writer import BagWriter
 
 
 def extract(bag: Path, folder: Path) -> list[Path]:
-    """Write the files that are attached to a bag; their paths.
+    """Write the files that are attached to a bag; return their paths.
 
     Raises:
         BagError: it has none, a name is no file's, a file is there already, or cannot be written;
@@ -59,7 +59,7 @@ def new_file(file: Path) -> BinaryIO:
 
 
 def versions() -> str:
-    """Versions of Python, ROS 2 and the installed packages, one a line."""
+    """Return the versions of Python, ROS 2 and the installed packages, one a line."""
     lines = [
         f"python {platform.python_version()}",
         f"system {platform.platform()}",
@@ -74,7 +74,7 @@ def versions() -> str:
 
 
 def code_checksum() -> str:
-    """SHA-256 of this package's own source files: its version does not change with each of them."""
+    """Return the SHA-256 of this package's source files: its version changes less often."""
     root = Path(__file__).parents[1]
     digest = hashlib.sha256()
     for file in sorted(root.rglob("*.py")):
@@ -111,11 +111,11 @@ def repair(path: str | Path, out: str | Path) -> Repaired:
         for note in bag.notes:
             if note.name != "rosbag2":  # which the writer makes anew
                 writer.note(note.name, note.metadata)
+        kept = []
         for topic in bag.topics:
-            if topic.encoding != "cdr":
-                damage.append(_left_out(topic, f"{topic.encoding} is not CDR"))
-                continue
             try:
+                if topic.encoding != "cdr":
+                    raise BagError(f"{topic.encoding} is not CDR")
                 writer.add_topic(
                     topic.name,
                     topic.type_name,
@@ -124,13 +124,11 @@ def repair(path: str | Path, out: str | Path) -> Repaired:
                     schema=topic.schema,
                     defined=False,
                 )
+                kept.append(topic.name)
             except BagError as error:
-                damage.append(_left_out(topic, str(error)))
-        for message in bag.messages(writer.topics, damage):
+                text = f"{topic.name} is left out: {error}"
+                damage.append(Fault(text, topic.message_count))
+        for message in bag.messages(kept, damage):
             times = message.log_time, message.publish_time
             writer.write(message.topic, message.data, *times, message.sequence)
     return Repaired(writer.path, writer.message_count, tuple(damage))
-
-
-def _left_out(topic: BagTopic, why: str) -> Fault:
-    return Fault(f"{topic.name} is left out: {why}", topic.message_count)

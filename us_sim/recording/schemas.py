@@ -22,13 +22,13 @@ _Fields = dict[str, tuple[Any, list[Any]]]  # constants and fields, by type, as 
 
 
 def normalized_type(name: str) -> str:
-    """``pkg/msg/Type`` for ``pkg/Type``, which early ROS 2 bags wrote; other names unchanged."""
+    """Return ``pkg/msg/Type`` for ``pkg/Type`` of early ROS 2 bags, other names unchanged."""
     package, _, rest = name.partition("/")
     return f"{package}/msg/{rest}" if rest and "/" not in rest else name
 
 
 def schema_text(type_name: str) -> str:
-    """The ``ros2msg`` schema of ``pkg/msg/Type``, followed by every type that it refers to.
+    """Return the ``ros2msg`` schema of ``pkg/msg/Type``, followed by every type that it refers to.
 
     Raises:
         BagError: neither an installed package nor rosbags' Jazzy types define it.
@@ -37,7 +37,7 @@ def schema_text(type_name: str) -> str:
 
 
 def type_hash(type_name: str) -> str:
-    """The hash of ``pkg/msg/Type`` (REP 2016), as ROS 2 announces it with each endpoint.
+    """Return the hash of ``pkg/msg/Type`` (REP 2016), as ROS 2 announces it with each endpoint.
 
     Raises:
         BagError: the type is not known.
@@ -47,7 +47,7 @@ def type_hash(type_name: str) -> str:
 
 @cache
 def definitions(type_name: str, text: str) -> Typestore:
-    """The types that a schema's text defines.
+    """Parse the types that a schema's text defines.
 
     Raises:
         BagError: the text is not a message definition.
@@ -65,12 +65,12 @@ def definitions(type_name: str, text: str) -> Typestore:
 
 @cache
 def jazzy_definitions() -> Typestore:
-    """The message types of ROS 2 Jazzy; the first call takes a twentieth of a second."""
+    """Return the message types of ROS 2 Jazzy; the first call takes a twentieth of a second."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 def stamped(type_name: str, stamp: int, frame_id: str, **fields: Any) -> memoryview:
-    """A message of Jazzy with a header and these fields as CDR; ``stamp`` in ns since the epoch."""
+    """Serialize a message of Jazzy with a header and these fields; ``stamp`` in ns since 1970."""
     store = jazzy_definitions()
     time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
     header = store.types["std_msgs/msg/Header"](stamp=time, frame_id=frame_id)
@@ -84,7 +84,7 @@ def _prefixes() -> str:
 
 @cache
 def _installed(type_name: str, prefixes: str) -> Typestore:
-    """A type with every one that it refers to."""
+    """Return a type with every one that it refers to."""
     found: _Fields = {}
     wanted = [type_name]
     while wanted:
@@ -98,7 +98,7 @@ def _installed(type_name: str, prefixes: str) -> Typestore:
 
 
 def _named(kind: Any) -> list[str]:
-    """The message that a field, or each element of one, is."""
+    """Return the message that a field, or each element of one, is."""
     node, content = kind
     if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         return _named(content[0])
@@ -106,7 +106,7 @@ def _named(kind: Any) -> list[str]:
 
 
 def _definition(type_name: str, prefixes: str) -> _Fields:
-    """One message, without those that it refers to."""
+    """Read one message, without those that it refers to."""
     match = _TYPE_NAME.fullmatch(type_name)
     if match is None:
         raise BagError(f"{type_name!r} is not a message type: write it as package/msg/Type")

@@ -20,7 +20,7 @@ from us_sim.errors import BagError
 from us_sim.recording.mcap_storage import McapStorage
 from us_sim.recording.metadata import BagMetadata, read_metadata
 from us_sim.recording.schemas import normalized_type
-from us_sim.recording.topic import BagMessage, BagTopic, Fault, QosProfile
+from us_sim.recording.topic import BagMessage, BagTopic, Fault
 
 _SQLITE_MAGIC = b"SQLite format 3\0"
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -65,7 +65,7 @@ class SqliteStorage:
     def messages(
         self, topics: Collection[str], _: list[Fault] | None, since: int | None = None
     ) -> Iterator[BagMessage]:
-        """The messages of these topics, since a log time (ns), in the order of their log times.
+        """Yield the messages of these topics, since a log time (ns), in the order of log times.
 
         Raises:
             BagError: the database is damaged.
@@ -89,7 +89,7 @@ def _topic(connection: Any) -> BagTopic:
         name=connection.topic,
         type_name=normalized_type(connection.msgtype),
         message_count=connection.msgcount,
-        qos=tuple(map(QosProfile.of, connection.ext.offered_qos_profiles)),
+        qos=tuple(connection.ext.offered_qos_profiles),
         type_hash=connection.digest or "",
         encoding=connection.ext.serialization_format,
         schema=definition.data if definition.format.name == "MSG" else None,
@@ -99,12 +99,8 @@ def _topic(connection: Any) -> BagTopic:
 Storage = McapStorage | SqliteStorage
 
 
-class NoBagError(BagError):
-    """A file that is of another kind."""
-
-
 def _open_packed(file: Path) -> Storage:
-    """The reader of a zstd file; of one that is cut off, of the bytes before the cut.
+    """Open a zstd file; of one that is cut off, of the bytes before the cut.
 
     Its decompressed copy is removed with the reader.
     """
@@ -128,7 +124,7 @@ def _open_packed(file: Path) -> Storage:
 
 
 def bag_files(path: Path) -> tuple[list[Path], BagMetadata | None]:
-    """The files that a bag consists of, and its ``metadata.yaml`` if it has one.
+    """Find the files that a bag consists of, and its ``metadata.yaml`` if it has one.
 
     Raises:
         BagError: there are none, or several bags could be meant.
@@ -154,11 +150,10 @@ def bag_files(path: Path) -> tuple[list[Path], BagMetadata | None]:
 
 
 def open_storage(file: Path, label: str = "") -> Storage:
-    """The reader of a file by its first bytes, whatever its name; errors name it, or the label.
+    """Open a file by its first bytes, whatever its name; errors name it, or the label.
 
     Raises:
-        NoBagError: the file is of another kind.
-        BagError: the file is empty, a bag of ROS 1, or damaged.
+        BagError: the file is empty, a bag of ROS 1, damaged, or of another kind.
     """
     label = label or str(file)
     with file.open("rb") as stream:
@@ -173,7 +168,10 @@ def open_storage(file: Path, label: str = "") -> Storage:
         return _open_packed(file)
     if start.startswith(b"#ROSBAG"):
         raise BagError(f"{label} is a bag of ROS 1: convert it with rosbags-convert first")
-    raise NoBagError(f"{label} is not a bag: it is neither MCAP nor SQLite, compressed or not")
+    raise BagError(
+        f"{label} is not a bag, neither MCAP nor SQLite, compressed or not: give one, or for poses "
+        f"a tracker recording of PLUS (.igs.mha, .igs.nrrd)"
+    )
 
 
 def missing_files(folder: Path, metadata: BagMetadata) -> list[str]:

@@ -5,67 +5,54 @@ Quality of service is in the YAML of rosbag2: policies by name since Jazzy, by n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from enum import Enum
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import yaml
-from rosbags.interfaces import QosTime
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag2.errors import ReaderError
-from rosbags.rosbag2.metadata import parse_qos
+from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from us_sim.errors import BagError
 
-INFINITE = 2**63 - 1  # ns, what rmw calls RMW_DURATION_INFINITE
-_DURATIONS = ("deadline", "lifespan", "liveliness_lease_duration")
+_INFINITE = QosTime(*divmod(2**63 - 1, 10**9))  # what rmw calls RMW_DURATION_INFINITE
+DEFAULT_QOS = Qos(
+    history=QosHistory.KEEP_LAST,
+    depth=10,
+    reliability=QosReliability.RELIABLE,
+    durability=QosDurability.VOLATILE,
+    deadline=_INFINITE,
+    lifespan=_INFINITE,
+    liveliness=QosLiveliness.AUTOMATIC,
+    liveliness_lease_duration=_INFINITE,
+    avoid_ros_namespace_conventions=False,
+)
+"""The quality of service that a publisher offers by default, as rclpy's does."""
 
 
-@dataclass(frozen=True)
-class QosProfile:
-    """The quality of service that a publisher offered; the defaults are rclpy's.
-
-    Policies are named as rmw names them in lower case.
-    """
-
-    history: str = "keep_last"
-    depth: int = 10
-    reliability: str = "reliable"
-    durability: str = "volatile"
-    deadline: int = INFINITE  # ns
-    lifespan: int = INFINITE  # ns
-    liveliness: str = "automatic"
-    liveliness_lease_duration: int = INFINITE  # ns
-    avoid_ros_namespace_conventions: bool = False
-
-    @classmethod
-    def of(cls, profile: Any) -> QosProfile:
-        """Return the profile that one of rclpy or rosbags is."""
-        if isinstance(profile, QosProfile):
-            return profile
-        values = {}
-        for each in fields(cls):
-            value = getattr(profile, each.name)
-            if isinstance(value, Enum):
-                value = value.name.lower()
-            elif isinstance(value, QosTime):
-                value = value.sec * 10**9 + value.nsec
-            values[each.name] = getattr(value, "nanoseconds", value)
-        return cls(**values)
-
-    @property
-    def summary(self) -> str:
-        """Its first four policies, for a person."""
-        names = ("history", "depth", "reliability", "durability")
-        return " ".join(f"{name}: {getattr(self, name)}" for name in names)
-
-    def document(self) -> dict[str, Any]:
-        """Return this profile as rosbag2 0.26 writes it."""
-        values = asdict(self)
-        for name in _DURATIONS:
-            seconds, rest = divmod(values[name], 10**9)
-            values[name] = {"sec": seconds, "nsec": rest}
-        return values
+def qos_of(profile: Any) -> Qos:
+    """Return a profile of rclpy as one of rosbags, whose policies have the same names."""
+    durations = (profile.deadline, profile.lifespan, profile.liveliness_lease_duration)
+    deadline, lifespan, lease = (QosTime(*divmod(each.nanoseconds, 10**9)) for each in durations)
+    return Qos(
+        QosHistory[profile.history.name],
+        profile.depth,
+        QosReliability[profile.reliability.name],
+        QosDurability[profile.durability.name],
+        deadline,
+        lifespan,
+        QosLiveliness[profile.liveliness.name],
+        lease,
+        profile.avoid_ros_namespace_conventions,
+    )
 
 
 def as_yaml(document: object) -> str:
@@ -73,12 +60,12 @@ def as_yaml(document: object) -> str:
     return yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
 
 
-def qos_to_yaml(profiles: Sequence[QosProfile]) -> str:
+def qos_to_yaml(profiles: Iterable[Qos]) -> str:
     """Write the YAML list that rosbag2 puts in a channel's ``offered_qos_profiles``."""
-    return as_yaml([profile.document() for profile in profiles]).rstrip()
+    return as_yaml(dump_qos_v9([*profiles])).rstrip()
 
 
-def qos_from_yaml(document: Any, where: str = "offered_qos_profiles") -> tuple[QosProfile, ...]:
+def qos_from_yaml(document: Any, where: str = "offered_qos_profiles") -> tuple[Qos, ...]:
     """Read the profiles of a bag of any version: YAML text, or the list that it parses to.
 
     Args:
@@ -89,7 +76,7 @@ def qos_from_yaml(document: Any, where: str = "offered_qos_profiles") -> tuple[Q
         BagError: the text is not YAML, or not a list of profiles.
     """
     try:
-        return tuple(map(QosProfile.of, parse_qos(document or [])))
+        return tuple(parse_qos(document or []))
     except (ReaderError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise BagError(f"{where}: this is not a list of QoS profiles: {reason}") from None
@@ -108,18 +95,18 @@ class BagTopic:
     name: str
     type_name: str  # package/msg/Type
     message_count: int
-    qos: tuple[QosProfile, ...] = ()
+    qos: tuple[Qos, ...] = ()
     type_hash: str = ""  # RIHS01_…; empty before ROS 2 Iron
     encoding: str = "cdr"
     schema: str | None = None  # ros2msg text; None where the bag carries none
 
     @property
     def is_latched(self) -> bool:
-        """Whether all its publishers kept messages for those who come later."""
-        return bool(self.qos) and all(q.durability == "transient_local" for q in self.qos)
+        """Return whether all its publishers kept messages for those who come later."""
+        return {q.durability for q in self.qos} == {QosDurability.TRANSIENT_LOCAL}
 
     def joined(self, other: BagTopic, bag: str) -> BagTopic:
-        """This topic with the messages of another channel or file of the same name.
+        """Return this topic with the messages of another channel or file of the same name.
 
         Raises:
             BagError: the two are of different types or encodings.

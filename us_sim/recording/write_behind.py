@@ -6,8 +6,10 @@ import queue
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
+
+from rosbags.interfaces import Qos
 
 from us_sim.errors import BagError
 from us_sim.recording.schemas import schema_text, type_hash
@@ -48,18 +50,13 @@ class WriteBehind:
         self._thread.start()
 
     @property
-    def path(self) -> str:
-        """The file that is written."""
-        return str(self._bag.path)
-
-    @property
     def problem(self) -> str:
-        """Why nothing is written at present; empty when something is."""
+        """Say why nothing is written at present; empty when something is."""
         return self._bag.problem
 
     @property
     def losses(self) -> Counter[str]:
-        """Messages that were lost so far, by topic."""
+        """Return the messages that were lost so far, by topic."""
         with self._lock:
             return self._lost.copy()
 
@@ -68,7 +65,7 @@ class WriteBehind:
         with self._lock:
             self._lost[topic] += count
 
-    def add_topic(self, topic: str, type_name: str, qos: Sequence[object] = ()) -> None:
+    def add_topic(self, topic: str, type_name: str, qos: Iterable[Qos] = ()) -> None:
         """Make a topic known before its first message.
 
         Raises:
@@ -157,7 +154,7 @@ class WriteBehind:
         except BagError as error:
             failure = str(error)
         except Exception as error:
-            failure = f"{self.path} cannot be written: {error!r}"
+            failure = f"{self._bag.path} cannot be written: {error!r}"
         told = failure or self.problem
         if told and told != self._told:
             self.untold.append(told)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from itertools import count
@@ -23,11 +23,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mcap.writer import CompressionType, Writer
+from rosbags.interfaces import Qos
 
 from us_sim.errors import BagError
-from us_sim.recording.metadata import BagMetadata
+from us_sim.recording.metadata import NO_TIME, BagMetadata
 from us_sim.recording.schemas import definitions, schema_text
-from us_sim.recording.topic import BagTopic, QosProfile, as_yaml, qos_to_yaml
+from us_sim.recording.topic import BagTopic, as_yaml, qos_to_yaml
 from us_sim.settings.spelling import counted
 from us_sim.share import full_path
 
@@ -96,7 +97,7 @@ class PatientFile:
 
 
 class BagWriter:
-    """Writes one bag: an MCAP file, and when it is closed, its ``metadata.yaml``.
+    """Writer of one bag: an MCAP file, and when it is closed, its ``metadata.yaml``.
 
     A message reaches the operating system with its chunk or with :meth:`flush`, and then survives
     the end of the process.
@@ -132,7 +133,7 @@ class BagWriter:
         if compression not in _COMPRESSIONS:
             raise BagError(f"chunks cannot be compressed with {compression!r}: use none or zstd")
         self._counts: Counter[str] = Counter()  # messages by topic
-        self._span: tuple[int, int] | None = None  # ns, of their log times
+        self._start, self._end = NO_TIME, 0  # ns, of their log times
         self._topics: dict[str, BagTopic] = {}
         self._channels: dict[str, int] = {}  # by topic
         self._schemas: dict[str, int] = {}  # by type
@@ -155,17 +156,12 @@ class BagWriter:
 
     @property
     def message_count(self) -> int:
-        """Number of messages written."""
+        """Return the number of messages written."""
         return self._counts.total()
 
     @property
-    def topics(self) -> tuple[str, ...]:
-        """Names of the topics added."""
-        return tuple(self._topics)
-
-    @property
     def problem(self) -> str:
-        """Why messages wait for room; empty when none do."""
+        """Say why messages wait for room; empty when none do."""
         if self._file.error is None or self._is_closed:
             return ""
         return f"{self._full()}: what it holds can be read, and the rest waits for room"
@@ -174,7 +170,7 @@ class BagWriter:
         self,
         topic: str,
         type_name: str,
-        qos: Sequence[object] = (),
+        qos: Iterable[Qos] = (),
         type_hash: str | None = None,
         *,
         schema: str | None = None,
@@ -185,8 +181,7 @@ class BagWriter:
         Args:
             topic: full name.
             type_name: ``package/msg/Type``.
-            qos: offered by its publishers, in any form that ``QosProfile.of`` takes. Later profiles
-                are in ``metadata.yaml`` alone.
+            qos: offered by its publishers. Later profiles are in ``metadata.yaml`` alone.
             type_hash: RIHS01 hash; computed from the definition by default.
             schema: ``ros2msg`` text; the installed or the Jazzy definition by default.
             defined: False takes a type whose definition is not known, and writes none.
@@ -197,7 +192,7 @@ class BagWriter:
         self._require_open()
         if not topic or any(character.isspace() for character in topic):
             raise BagError(f"{topic!r} is not a topic name")
-        profiles = tuple(map(QosProfile.of, qos))
+        profiles = tuple(qos)
         if (known := self._topics.get(topic)) is not None:
             if known.type_name != type_name:
                 raise BagError(
@@ -261,8 +256,8 @@ class BagWriter:
         channel, number = self._channels[topic], sequence & 0xFFFFFFFF
         self._writer.add_message(channel, log_time_ns, bytes(cdr), publish_time_ns, number)
         self._counts[topic] += 1
-        first, last = self._span or (log_time_ns, log_time_ns)
-        self._span = min(first, log_time_ns), max(last, log_time_ns)
+        self._start = min(self._start, log_time_ns)
+        self._end = max(self._end, log_time_ns)
 
     def attach(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
         """Put a file into the bag, such as the scene that is recorded.
@@ -310,37 +305,33 @@ class BagWriter:
         self._add_metadata()
         self._writer.finish()
         self._file.use_reserve()
-        self._is_closed = True
         self._file.close()
-        told = []
-        if self._file.error is not None:
-            told.append(
+        problems = []
+        if self.problem:
+            problems.append(
                 f"{self._full()}; what came since and its index are missing, and `us-sim bag "
                 f"repair` makes an index where there is room"
             )
+        self._is_closed = True
         if not self.path.exists():
-            told.append(
+            problems.append(
                 f"{self.path} was removed or moved away while it was recorded, with "
                 f"{counted(self.message_count, 'message')}"
             )
         elif self._metadata_file is not None:
-            told += self._write_metadata_file(self._metadata_file)
-        if told:
-            raise BagError("; ".join(told))
-
-    def _write_metadata_file(self, metadata_file: Path) -> list[str]:
-        try:
-            with metadata_file.open("x", encoding="utf-8") as file:
-                file.write(self._metadata().document())
-        except OSError as error:
-            if not isinstance(error, FileExistsError):
-                metadata_file.unlink(missing_ok=True)
-            return [
-                f"{metadata_file} cannot be written ({error.strerror}): the recording can be read "
-                f"without it, and `us-sim bag repair {metadata_file.parent}` makes a bag that has "
-                f"it"
-            ]
-        return []
+            try:
+                with self._metadata_file.open("x", encoding="utf-8") as file:
+                    file.write(self._metadata().document())
+            except OSError as error:
+                if not isinstance(error, FileExistsError):
+                    self._metadata_file.unlink(missing_ok=True)
+                problems.append(
+                    f"{self._metadata_file} cannot be written ({error.strerror}): the recording "
+                    f"can be read without it, and `us-sim bag repair {self.path.parent}` makes a "
+                    f"bag that has it"
+                )
+        if problems:
+            raise BagError("; ".join(problems))
 
     def __enter__(self) -> BagWriter:
         return self
@@ -365,13 +356,8 @@ class BagWriter:
         topics = tuple(
             replace(topic, message_count=self._counts[name]) for name, topic in self._topics.items()
         )
-        metadata = BagMetadata((self.path.name,), topics)
-        if self._span is None:
-            return metadata
-        first, last = self._span
-        return replace(
-            metadata, start=first, duration=last - first, message_count=self.message_count
-        )
+        extent = self._start, max(self._end - self._start, 0)
+        return BagMetadata((self.path.name,), topics, *extent, self.message_count)
 
 
 def _names(path: Path, sidecar: bool, further: bool) -> tuple[Path, Path | None]:

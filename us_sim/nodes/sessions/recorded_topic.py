@@ -10,11 +10,11 @@ from typing import Any
 from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
+from rosbags.interfaces import Qos, QosDurability, QosReliability
 
 from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.recording.schemas import schema_text
-from us_sim.recording.topic import QosProfile
 
 QUEUE = 1000  # messages that may wait for the executor
 
@@ -42,17 +42,16 @@ class RecordedTopic:
         node: GuardedNode,
         name: str,
         type_name: str,
-        offered: Iterable[QoSProfile],
+        offered: list[Qos],
         take: Callable[[str, bytes, Mapping[str, Any]], None],
         lost: Callable[[str, int], None],
     ) -> None:
         self.name, self.type_name = name, type_name
         self._node, self._type = node, message_type(type_name)
         self._take, self._lost = take, lost
-        profiles = [QosProfile.of(profile) for profile in offered]
-        self._offered = dict.fromkeys(profiles)
+        self._offered = dict.fromkeys(offered)
         self._adopted = _adopted(self._offered)
-        self._publishers = len(profiles)
+        self._publishers = len(offered)
         self._sequence: int | None = None
         self._subscription = self._subscribed()
 
@@ -61,12 +60,11 @@ class RecordedTopic:
         """Whether its publishers keep messages for those who come later."""
         return self._adopted.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
-    def follow(self, offered: Iterable[QoSProfile]) -> list[QosProfile]:
+    def follow(self, offered: list[Qos]) -> list[Qos]:
         """Follow the qualities that publishers offer now; those that none has offered before."""
-        now = [QosProfile.of(profile) for profile in offered]
-        if len(now) != self._publishers:
-            self._publishers, self._sequence = len(now), None
-        new = [profile for profile in dict.fromkeys(now) if profile not in self._offered]
+        if len(offered) != self._publishers:
+            self._publishers, self._sequence = len(offered), None
+        new = [profile for profile in dict.fromkeys(offered) if profile not in self._offered]
         self._offered |= dict.fromkeys(new)
         adopted = _adopted(self._offered)
         if adopted != self._adopted:
@@ -125,11 +123,11 @@ class RecordedTopic:
             self._lost(self.name, status.total_count_change)
 
 
-def _adopted(offered: Iterable[QosProfile]) -> QoSProfile:
+def _adopted(offered: Iterable[Qos]) -> QoSProfile:
     """The quality of service that every publisher can serve, as rosbag2 chooses it."""
     offered = list(offered)
-    reliable = all(q.reliability == "reliable" for q in offered)
-    latched = all(q.durability == "transient_local" for q in offered)
+    reliable = all(q.reliability == QosReliability.RELIABLE for q in offered)
+    latched = all(q.durability == QosDurability.TRANSIENT_LOCAL for q in offered)
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=QUEUE,
