@@ -14,7 +14,7 @@ _LONGEST = 200  # characters of what is being done
 _PATIENCE = 1.0  # s, for which work goes on without a bar
 
 
-class Progress:
+class Progress(tqdm):
     """A bar on stderr from 0 to ``total``; without a total, only the text.
 
     Where stderr is no terminal it writes a line every few seconds instead.
@@ -29,9 +29,8 @@ class Progress:
     def __init__(
         self, description: str, total: float | None, unit: str = "", *, delay: float = 0.0
     ) -> None:
-        self._total = total
         amount = ": {percentage:3.0f} %|{bar}| {n:.0f}/{total:.0f} " + f"{unit}, {{elapsed}}"
-        self._bar = tqdm(
+        super().__init__(
             desc=description,
             total=total,
             bar_format=f"{{desc}}{'' if total is None else amount}{{postfix}}",
@@ -42,16 +41,10 @@ class Progress:
             delay=delay,
         )
 
-    def update(self, done: float, text: str = "") -> None:
+    def update(self, done: float, text: str = "") -> None:  # type: ignore[override]
         """Show that ``done`` of the total is done."""
-        self._bar.set_postfix_str(printable(text, _LONGEST), refresh=False)
-        self._bar.update((done if self._total is None else min(done, self._total)) - self._bar.n)
-
-    def __enter__(self) -> Progress:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
+        self.set_postfix_str(printable(text, _LONGEST), refresh=False)
+        super().update((done if self.total is None else min(done, self.total)) - self.n)
 
 
 def late_progress(description: str) -> Callable[[float, str], None]:
@@ -67,7 +60,7 @@ def late_progress(description: str) -> Callable[[float, str], None]:
         bar = bar or Progress(description, 100, "%", delay=_PATIENCE)
         bar.update(100 * fraction, text)
         if fraction >= 1.0:
-            bar.__exit__()
+            bar.close()
             bar = None
 
     return show

@@ -184,10 +184,10 @@ def test_moving_probe_and_points_together_changes_nothing(collider, where, posit
         (lambda: Capsule("wide", 1.0), "radius: 'wide'"),
         (lambda: RoundedBox(0.05, 0.015, float("inf"), 0.003), "height: inf"),
         (lambda: RoundedBox(0.05, 0.015, 0.1, 0.008), "rounding: .* 0.0075 m"),
-        (lambda: Convex(-0.05, 0.06, 0.02, 0.06, 0.005), "radius: -0.05 m"),
-        (lambda: Convex(0.05, 0.06, 0.02, 0.06, 0.011), "rounding: .* 0.01 m"),
-        (lambda: Convex(0.03, 0.06, 0.02, 0.06, 0.005), "75 .* 0.0583 m"),
-        (lambda: Convex(0.055, 0.07, 0.02, 0.015, 0.005), "height: .* 0.02 m"),
+        (lambda: Convex(0.06, 0.02, 0.06, 0.005, -0.05), "radius: -0.05 m"),
+        (lambda: Convex(0.06, 0.02, 0.06, 0.011, 0.05), "rounding: .* 0.01 m"),
+        (lambda: Convex(0.06, 0.02, 0.06, 0.005, 0.03), "75 .* 0.0583 m"),
+        (lambda: Convex(0.07, 0.02, 0.015, 0.005, 0.055), "height: .* 0.02 m"),
     ],
 )
 def test_impossible_dimensions_are_refused(make, words):

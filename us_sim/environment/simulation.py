@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from us_sim.errors import SceneError
-from us_sim.geometry.pose import Pose, lifted
+from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import rotation_exp
 from us_sim.progress import late_progress
 from us_sim.scene.building import (
@@ -38,6 +38,7 @@ from us_sim.scene.building import (
 )
 from us_sim.scene.episode import Draws
 from us_sim.scene.scene import Scene
+from us_sim.scoring.lumen import lifted
 from us_sim.settings.registry import SOLVERS
 from us_sim.slicing.acoustics.surface_echo import surface_normals_of
 from us_sim.slicing.b_mode import BMode

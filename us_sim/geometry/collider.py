@@ -20,7 +20,10 @@ _ROUNDING = Quantity("length", 1e-5, 0.25)
 
 @dataclass(frozen=True)
 class _Shape(Settings):
-    """A box grown by a rounding.
+    """A box grown by a rounding, its `offset_box`.
+
+    That is (4,) m: half extents x, y, z of the core box, and the rounding around it; (5,) where
+    the core's front is curved, with its curvature, 1/m.
 
     Raises:
         ProbeError: a dimension is out of its range, or they do not go together.
@@ -28,13 +31,6 @@ class _Shape(Settings):
 
     section = "probe.collider"
     error = ProbeError
-
-    @property
-    def offset_box(self) -> NDArray[np.float64]:
-        """(4,) m: half extents x, y, z of the core box, and the rounding around it; (5,) where the
-        core's front is curved, with its curvature, 1/m.
-        """
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -86,25 +82,17 @@ class RoundedBox(_Shape):
 
 
 @dataclass(frozen=True)
-class Convex(_Shape):
+class Convex(RoundedBox):
     """A curved array: a rounded box whose face is part of a cylinder about a line along y."""
 
     radius: float = setting(_SIZE, "of the face's curvature")
-    length: float = setting(_SIZE, "along the probe's x, over everything")
-    width: float = setting(_SIZE, "along the probe's y, over everything")
-    height: float = setting(_SIZE, "along the probe's z, over everything")
-    rounding: float = setting(_ROUNDING, "radius of edges and corners")
 
     def check(self) -> None:
         """Refuse dimensions that do not go together."""
-        smallest = min(self.length, self.width, 2 * self.radius)
-        if 2 * self.rounding > smallest:
-            raise self.refused(
-                "rounding",
-                f"{self.rounding:g} m is more than half of the smallest of length, width and twice "
-                f"the radius ({smallest:g} m): give at most {smallest / 2:g} m",
-            )
+        super().check()
         core = self.radius - self.rounding
+        if core <= 0.0:
+            raise self.refused("radius", f"{self.radius:g} m is no more than the rounding")
         longest = 2 * (core * math.sin(_STEEPEST) + self.rounding)
         if self.length > longest:
             raise self.refused(
@@ -122,9 +110,7 @@ class Convex(_Shape):
 
     @property
     def offset_box(self) -> NDArray[np.float64]:
-        sides = np.array([self.length, self.width, self.height])
-        core = self.radius - self.rounding
-        return np.append(sides / 2 - self.rounding, [self.rounding, 1 / core])
+        return np.append(super().offset_box, 1 / (self.radius - self.rounding))
 
 
 Collider = Sphere | Capsule | RoundedBox | Convex

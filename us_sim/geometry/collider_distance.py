@@ -43,7 +43,7 @@ def rotate_back(r, x, y, z):
 def signed_distance(
     collider: Collider, pose: Pose, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Distance of points to the collider's surface, and its outward normal there.
+    """Measure the distance of points to the collider's surface, and its outward normal there.
 
     Every shape here is a box (for a sphere a point, for a capsule a segment) grown by a rounding;
     the box of a curved array has a curved front. The formulas are exact. Where the nearest surface

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
-from dataclasses import dataclass, field
 
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import interpolate
@@ -46,7 +45,7 @@ class PoseHistory:
         self.poses.clear()
 
     def at(self, stamp: int) -> Pose | None:
-        """The pose at a stamp, interpolated; None where it is not known."""
+        """Interpolate the pose at a stamp; None where it is not known."""
         k = bisect_left(self.stamps, stamp)
         if k < len(self.stamps) and self.stamps[k] == stamp:
             return self.poses[k]
@@ -57,19 +56,6 @@ class PoseHistory:
             return None
         fraction = (stamp - before) / (after - before)
         return interpolate(self.poses[k - 1], self.poses[k], fraction)
-
-
-@dataclass(eq=False)
-class _Link:
-    """A frame in its parent; without poses over time it is fixed."""
-
-    parent: str
-    fixed: Pose | None = None
-    moving: PoseHistory = field(default_factory=PoseHistory)
-
-    def at(self, stamp: int) -> Pose | None:
-        """The pose at a stamp; None where it was not known yet."""
-        return self.moving.at(stamp) if self.fixed is None else self.fixed
 
 
 class FrameChain:
@@ -86,35 +72,40 @@ class FrameChain:
 
     def __init__(self, frame: str, top: str) -> None:
         self._frame, self._top = frame, top
-        self._links: dict[str, _Link] = {}
+        self._links: dict[str, tuple[str, Pose | PoseHistory]] = {}  # by frame, with its parent
         self._newest: int | None = None  # ns, of the last pose
 
     def links(self) -> list[str] | None:
-        """The frames from the lowest up to below the top; None while they do not meet."""
+        """Return the frames from the lowest up to below the top; None while they do not meet."""
         found: list[str] = []
         frame = self._frame
         while frame != self._top:
             if frame not in self._links or frame in found:
                 return None
             found.append(frame)
-            frame = self._links[frame].parent
+            frame = self._links[frame][0]
         return found
+
+    def _moving(self) -> dict[str, PoseHistory]:
+        """Return the links on the way that are not fixed."""
+        links = {link: self._links[link][1] for link in self.links() or ()}
+        return {link: each for link, each in links.items() if isinstance(each, PoseHistory)}
 
     @property
     def is_fixed(self) -> bool:
         """Whether there is a way, and nothing on it moves."""
-        links = self.links()
-        return links is not None and all(self._links[link].fixed for link in links)
+        return self.links() is not None and not self._moving()
 
     def restart(self) -> None:
         """Forget what moved."""
         self._newest = None
-        for link in self._links.values():
-            link.moving.clear()
+        for _, link in self._links.values():
+            if isinstance(link, PoseHistory):
+                link.clear()
 
     def fix(self, frame: str, parent: str, pose: Pose) -> None:
         """Put a frame for good at a pose in its parent."""
-        self._links[frame] = _Link(parent, pose)
+        self._links[frame] = parent, pose
 
     def move(self, frame: str, parent: str, stamp: int, pose: Pose) -> tuple[int, Pose] | None:
         """Take a frame's pose in its parent at a stamp, ns.
@@ -123,28 +114,29 @@ class FrameChain:
             The stamp and the pose of the lowest frame in the top; None where no later one than the
             last can be made.
         """
-        link = self._links.get(frame)
-        if link is None or link.parent != parent or link.fixed is not None:
-            link = self._links[frame] = _Link(parent)
-        stamps = link.moving.stamps
-        if stamps and stamp <= stamps[-1]:
-            if stamp > stamps[-1] - _RESTART:
+        above, history = self._links.get(frame, ("", None))
+        if above != parent or not isinstance(history, PoseHistory):
+            history = PoseHistory()
+            self._links[frame] = parent, history
+        if history.stamps and stamp <= history.stamps[-1]:
+            if stamp > history.stamps[-1] - _RESTART:
                 return None
             self.restart()
-        link.moving.add(stamp, pose)
+        history.add(stamp, pose)
         links = self.links()
         return self._composed(links) if links is not None and frame in links else None
 
     def _composed(self, links: list[str]) -> tuple[int, Pose] | None:
-        stamps = [self._links[each].moving.stamps for each in links if not self._links[each].fixed]
-        if not all(stamps):
+        moving = self._moving().values()
+        if not all(each.stamps for each in moving):
             return None
-        stamp = min(each[-1] for each in stamps)
+        stamp = min(each.stamps[-1] for each in moving)
         if self._newest is not None and stamp <= self._newest:
             return None
         found = Pose()
         for link in links:
-            pose = self._links[link].at(stamp)
+            _, place = self._links[link]
+            pose = place.at(stamp) if isinstance(place, PoseHistory) else place
             if pose is None:
                 return None
             found = pose @ found
@@ -152,12 +144,8 @@ class FrameChain:
         return stamp, found
 
     def lag(self) -> tuple[str, float]:
-        """The link whose newest stamp is the oldest, and the s by which another one is newer."""
-        newest = {
-            link: self._links[link].moving.stamps[-1]
-            for link in self.links() or ()
-            if self._links[link].moving.stamps
-        }
+        """Return the link whose newest stamp is the oldest, and the s by which another is newer."""
+        newest = {link: each.stamps[-1] for link, each in self._moving().items() if each.stamps}
         if not newest:
             return "", 0.0
         last = min(newest, key=newest.__getitem__)

@@ -1,9 +1,9 @@
-"""Faces of tetrahedra, a mesh's boundary, and connected parts of a graph."""
+"""Faces of tetrahedra, and a mesh's boundary."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 # The four outward faces of a positively oriented tetrahedron.
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
@@ -39,16 +39,3 @@ def boundary_faces(tetrahedra: NDArray[np.integer]) -> NDArray[np.intp]:
     """(F,) ascending numbers, as in `face_order`, of the faces of one tetrahedron only."""
     order, starts, counts = face_order(tetrahedra)
     return np.sort(order[starts[counts == 1]])
-
-
-def connected_parts(count: int, one: ArrayLike, other: ArrayLike) -> NDArray[np.int64]:
-    """(``count``,) the part of each vertex, from 0 in the order of their first vertices.
-
-    Args:
-        one, other: (E,) the vertices that each edge joins.
-    """
-    from scipy.sparse import coo_array  # which a tenth of a second is saved where no mesh is
-    from scipy.sparse.csgraph import connected_components
-
-    joined = coo_array((np.ones(np.size(one)), (one, other)), shape=(count, count))
-    return np.asarray(connected_components(joined, directed=False)[1], dtype=np.int64)

@@ -33,20 +33,16 @@ def read_with_meshio(path: Path, refusal: str) -> Any:
     try:
         # For a file that none of its readers takes, meshio prints and then leaves the process.
         silence = io.StringIO()
-        with (
-            contextlib.redirect_stdout(silence),
-            contextlib.redirect_stderr(silence),
-            np.errstate(all="ignore"),
-        ):
+        with contextlib.redirect_stdout(silence), contextlib.redirect_stderr(silence):
             mesh = meshio.read(path)
-            count = len(mesh.points)
-            for block in mesh.cells:
-                # An index below 0 would count from the last point.
-                if len(block.data) and not 0 <= np.min(block.data) <= np.max(block.data) < count:
-                    raise MeshError(
-                        f"the file has cells that name points beyond the {count} that are there"
-                    )
-            return mesh
+        count = len(mesh.points)
+        for block in mesh.cells:
+            # An index below 0 would count from the last point.
+            if len(block.data) and not 0 <= np.min(block.data) <= np.max(block.data) < count:
+                raise MeshError(
+                    f"the file has cells that name points beyond the {count} that are there"
+                )
+        return mesh
     except MeshError:
         raise
     except (FileNotFoundError, ModuleNotFoundError) as error:

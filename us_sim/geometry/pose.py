@@ -138,16 +138,6 @@ def same_pose(a: Pose | None, b: Pose | None) -> bool:
     return np.array_equal(a.position, b.position) and np.array_equal(a.orientation, b.orientation)
 
 
-_STEEPEST = 0.2
-"""Cosine of a probe's tilt; beyond it, how far it would have to be lifted means nothing."""
-
-
-def lifted(pose: Pose) -> Pose:
-    """The pose of a probe in the same image plane that does not press into z > 0."""
-    depth = max(float(pose.position[2]), 0.0) / max(float(pose.rotation[2, 2]), _STEEPEST)
-    return Pose(pose.position - depth * pose.rotation[:, 2], pose.orientation)
-
-
 PLACE = Quantity("length", -10.0, 10.0)  # A coordinate of something near the patient
 
 

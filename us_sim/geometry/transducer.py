@@ -185,8 +185,8 @@ def _part(
     here = np.arange(count)
     there = np.roll(here, -1)
     triangles = []
-    for k in range(len(rings) - 1):
-        a, b = k * count, (k + 1) * count
+    for a in range(0, count * (len(rings) - 1), count):
+        b = a + count
         triangles.append(np.column_stack([a + here, a + there, b + there]))
         triangles.append(np.column_stack([a + here, b + there, b + here]))
     first, last = len(vertices) - 2, len(vertices) - 1

@@ -64,7 +64,7 @@ class SpaceMouseDriver(GuardedNode):
         while not self._closing.is_set():
             mouse.wait(self._patience)
             now = self.get_clock().now().nanoseconds
-            self._take((now, mouse.name, mouse.axes, mouse.buttons))
+            self._take((now, mouse.name, list(mouse.axes), mouse.buttons))
 
     # In the node's thread.
 

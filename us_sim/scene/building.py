@@ -518,7 +518,11 @@ def structures_of(
         colour = colour_of(scene, name)
         try:
             if given.file:
-                yield Structure(name, colour, EmbeddedSurface(mesh, *_surface_of(scene, name)))
+                from us_sim.skin.surface import read_surface
+
+                surface = read_surface(Path(given.file), given.unit)
+                vertices = given.pose.pose.apply(surface.vertices)
+                yield Structure(name, colour, EmbeddedSurface(mesh, vertices, surface.triangles))
                 continue
             from us_sim.volume.surfaces.label_surface import label_surface, spacing_for
 
@@ -527,15 +531,6 @@ def structures_of(
             yield Structure(name, colour, EmbeddedSurface.trimmed(mesh, *around))
         except UsSimError as error:
             raise SceneError(f"{scene.origin}: structures.{name}: {error}") from error
-
-
-def _surface_of(scene: Scene, name: str) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    from us_sim.skin.surface import read_surface
-
-    given = scene.structures[name]
-    assert given.file is not None
-    surface = read_surface(Path(given.file), given.unit)
-    return given.pose.pose.apply(surface.vertices), surface.triangles
 
 
 def blood_of(scene: Scene, volume: Volume) -> Blood:

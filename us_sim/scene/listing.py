@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -49,7 +50,9 @@ def listed_scene(name: str) -> ListedScene:
     try:
         scene = load_scene(name)
     except UsSimError as error:
-        origin = _origin(name)
+        origin = name
+        with contextlib.suppress(UsSimError):
+            origin = str(find_scene(name))
         return ListedScene(Path(name).stem, origin, problem=str(error).removeprefix(f"{origin}: "))
     return ListedScene(
         scene.name,
@@ -59,13 +62,6 @@ def listed_scene(name: str) -> ListedScene:
         probe=scene.probe.geometry,
         tracker=scene.tracker.source.name,
     )
-
-
-def _origin(name: str) -> str:
-    try:
-        return str(find_scene(name))
-    except UsSimError:
-        return name
 
 
 def _listed_case(folder: Path) -> ListedScene:

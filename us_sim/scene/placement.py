@@ -161,7 +161,9 @@ def check_path_in_volume(
     if shown.max() >= _LITTLE:
         return
     reaches = " × ".join(f"{1e3 * a:.0f} to {1e3 * b:.0f}" for a, b in volume.extent.T)
-    middle = 1e3 * np.mean([pose.apply(_middle(probe))[0] for pose in poses], axis=0)
+    pixel = [(probe.columns - 1) / 2, (probe.rows - 1) / 2, 0.0, 1.0]  # in the image's middle
+    place = (probe.image_to_probe @ pixel)[None, :3]
+    middle = 1e3 * np.mean([pose.apply(place)[0] for pose in poses], axis=0)
     raise SceneError(
         f"{scene.origin}: volume.pose: the volume, {scene.volume.name}, is seen in no image along "
         f"{file.name}: in `patient` it reaches from {reaches} mm, and the middle of the images is "
@@ -178,9 +180,3 @@ def _sampled(scene: Scene, path: ProbePath) -> list[Pose]:
     picked = np.unique(np.linspace(0, len(path) - 1, _POSES).round().astype(int))
     tracked = [Pose(path.positions[i], path.orientations[i]) for i in picked]
     return [registration @ pose @ calibration for pose in tracked]
-
-
-def _middle(probe: Probe) -> NDArray[np.float64]:
-    """(1, 3) m, the middle of the image in frame ``probe``."""
-    pixel = [(probe.columns - 1) / 2, (probe.rows - 1) / 2, 0.0, 1.0]
-    return (probe.image_to_probe @ pixel)[None, :3]

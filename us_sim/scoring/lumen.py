@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
-from us_sim.geometry.pose import Pose, lifted
+from us_sim.geometry.pose import Pose
 from us_sim.scoring.centre_line import CentreLine, places_of
 from us_sim.scoring.metrics import Section
 from us_sim.slicing.b_mode import BMode
@@ -21,6 +21,16 @@ VESSELS = ("vein", "artery")  # kinds of tissue whose cross-sections are measure
 _HARDLY_CUT = 0.1
 """Of a vessel's mean cross-section, or else of its largest in an image at rest: less of it is its
 edge, or cut off by the image."""
+
+
+_STEEPEST = 0.2
+"""Cosine of a probe's tilt; beyond it, how far it would have to be lifted means nothing."""
+
+
+def lifted(pose: Pose) -> Pose:
+    """Lift a probe within its image plane until it does not press into z > 0."""
+    depth = max(float(pose.position[2]), 0.0) / max(float(pose.rotation[2, 2]), _STEEPEST)
+    return Pose(pose.position - depth * pose.rotation[:, 2], pose.orientation)
 
 
 def lumens_of(label_names: Mapping[int, str]) -> dict[str, tuple[int, ...]]:

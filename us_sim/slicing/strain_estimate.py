@@ -254,10 +254,14 @@ def estimate_strain(
     """
     require_short_windows(probe, settings)
     step = probe.depth / probe.samples
-    across = _line_spacing(probe)
+    across = probe.width  # between lines
+    if probe.lines > 1:
+        middle = probe.beam_starts + 0.5 * probe.depth * probe.beam_directions
+        across = float(np.linalg.norm(np.diff(middle, axis=0), axis=1).mean())
     window = _odd(settings.window / step), _odd(settings.window / 3.0 / across)
     search = max(1, round(settings.search / step))
-    first, second = (_along_beams(image, probe) for image in (earlier, later))
+    pixels = probe.beam_pixels
+    first, second = (_remapped(each.astype(np.float32), *pixels) for each in (earlier, later))
     moved, correlation = track(first, second, window=window, search=search)
     weight = correlation >= max(settings.correlation, 1e-3)
     steep = slope(moved, weight, _odd(settings.fit / step))
@@ -284,17 +288,6 @@ def require_short_windows(probe: Probe, settings: Strain) -> None:
 
 def _odd(count: float) -> int:
     return max(3, 2 * round((count - 1.0) / 2.0) + 1)
-
-
-def _line_spacing(probe: Probe) -> float:
-    if probe.lines < 2:
-        return probe.width
-    middle = probe.beam_starts + 0.5 * probe.depth * probe.beam_directions
-    return float(np.linalg.norm(np.diff(middle, axis=0), axis=1).mean())
-
-
-def _along_beams(image: NDArray[np.uint8], probe: Probe) -> NDArray[np.float32]:
-    return _remapped(image.astype(np.float32), *probe.beam_pixels)
 
 
 def _to_pixels(values: NDArray[np.float32], probe: Probe) -> NDArray[np.float32]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from math import pi
+from math import hypot, pi
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ class PoseFilter(ABC):
 
     @abstractmethod
     def update(self, measurement: Measurement) -> Measurement:
-        """The measurement with its pose filtered."""
+        """Filter the measurement's pose."""
 
     @abstractmethod
     def reset(self) -> None:
@@ -52,11 +52,11 @@ class Unfiltered(PoseFilter):
 
     lag = 0.0
 
-    def __init__(self, settings: Settings | None = None) -> None:
+    def __init__(self, _: Settings | None = None) -> None:
         """There is nothing to set."""
 
     def update(self, measurement: Measurement) -> Measurement:
-        """The measurement itself."""
+        """Return the measurement itself."""
         return measurement
 
     def reset(self) -> None:
@@ -69,8 +69,7 @@ def create_filter(name: str, settings: Settings | None = None) -> PoseFilter:
     Raises:
         TrackingError: there is no filter of that name.
     """
-    filter_class = FILTERS.load(name)
-    made: PoseFilter = filter_class(settings or FILTERS.settings(name)())
+    made: PoseFilter = FILTERS.load(name)(settings or FILTERS.settings(name)())
     return made
 
 
@@ -102,7 +101,7 @@ class OneEuro(PoseFilter):
         self._angular_velocity = np.zeros(3)  # rad/s about the parent's axes, low-passed
 
     def update(self, measurement: Measurement) -> Measurement:
-        """The measurement with its pose filtered."""
+        """Filter the measurement's pose."""
         pose, before = measurement.pose, self._measured
         if before is None:
             self._pose = pose
@@ -115,30 +114,22 @@ class OneEuro(PoseFilter):
             self._angular_velocity = self._angular_velocity + alpha * (
                 turn - self._angular_velocity
             )
-            self._pose = self._towards(pose, step)
+            position, orientation = self._pose.position, self._pose.orientation
+            position = position + _alpha(self._cutoff, step) * (pose.position - position)
+            turn = rotation_between(orientation, pose.orientation)
+            speed = hypot(*self._angular_velocity)
+            cutoff = self._settings.rotation_minimum_cutoff
+            cutoff += self._settings.rotation_speed_coefficient * speed
+            turn = _alpha(cutoff, step) * turn
+            self._pose = Pose(position, product(rotation_exp(turn), orientation))
         self._measured = measurement
         return dataclasses.replace(measurement, pose=self._pose)
-
-    def _towards(self, pose: Pose, step: float) -> Pose:
-        """The filtered pose after a step (s) towards a measured one."""
-        position, orientation = self._pose.position, self._pose.orientation
-        position = position + _alpha(self._cutoff, step) * (pose.position - position)
-        turn = rotation_between(orientation, pose.orientation)
-        turn = _alpha(self._rotation_cutoff, step) * turn
-        return Pose(position, product(rotation_exp(turn), orientation))
 
     @property
     def _cutoff(self) -> float:
         """Hz, of the position."""
         settings = self._settings
-        return settings.minimum_cutoff + settings.speed_coefficient * _norm(self._velocity)
-
-    @property
-    def _rotation_cutoff(self) -> float:
-        """Hz, of the rotation."""
-        settings = self._settings
-        speed = _norm(self._angular_velocity)
-        return settings.rotation_minimum_cutoff + settings.rotation_speed_coefficient * speed
+        return settings.minimum_cutoff + settings.speed_coefficient * hypot(*self._velocity)
 
     @property
     def lag(self) -> float:
@@ -151,12 +142,8 @@ class OneEuro(PoseFilter):
 
 
 def _alpha(cutoff: float, step: float) -> float:
-    """The smoothing factor for a cutoff (Hz) and a step (s): Casiez et al. (2012), eq. 5."""
+    """Return the smoothing factor of a cutoff (Hz) and a step (s): Casiez et al., eq. 5."""
     return 1.0 / (1.0 + 1.0 / (2.0 * pi * cutoff * step))
-
-
-def _norm(vector: NDArray[np.float64]) -> float:
-    return float(np.sqrt(vector @ vector))
 
 
 # The speed of the first pose is not known: one standard deviation of it.
@@ -200,11 +187,14 @@ class ConstantVelocityKalman(PoseFilter):
         self._covariance: NDArray[np.float64] = np.zeros((12, 12))
 
     def update(self, measurement: Measurement) -> Measurement:
-        """The measurement with its pose filtered, and the covariance of that."""
+        """Filter the measurement's pose, with the covariance of that."""
         given = measurement.covariance
         noise = self._usual_noise if given is None else given
         if self._stamp is None:
-            self._start(measurement, noise)
+            self._place = measurement.pose.position, measurement.pose.orientation
+            self._covariance[_POSE, _POSE] = noise
+            speeds = [_INITIAL_SPEED**2] * 3 + [_INITIAL_ANGULAR_SPEED**2] * 3
+            self._covariance[_VELOCITY, _VELOCITY] = np.diag(speeds)
         else:
             self._correct(measurement, noise)
         self._stamp = measurement.stamp
@@ -214,14 +204,8 @@ class ConstantVelocityKalman(PoseFilter):
             measurement.stamp, pose, self._covariance[_POSE, _POSE], measurement.error
         )
 
-    def _start(self, measurement: Measurement, noise: NDArray[np.float64]) -> None:
-        self._place = measurement.pose.position, measurement.pose.orientation
-        self._covariance[_POSE, _POSE] = noise
-        speeds = [_INITIAL_SPEED**2] * 3 + [_INITIAL_ANGULAR_SPEED**2] * 3
-        self._covariance[_VELOCITY, _VELOCITY] = np.diag(speeds)
-
     def predicted(self, stamp: int) -> tuple[_Place, NDArray[np.float64]]:
-        """Where the pose is at a later stamp if its velocity stays, and the error's covariance.
+        """Predict the pose at a later stamp if its velocity stays, and the error's covariance.
 
         Returns:
             position (3,) m and orientation (4,), and (12, 12) as in the class.
@@ -253,7 +237,8 @@ class ConstantVelocityKalman(PoseFilter):
         gain: NDArray[np.float64] = np.linalg.solve(
             covariance[_POSE, _POSE] + noise, covariance[_POSE]
         ).T.astype(np.float64, copy=False)
-        correction = gain @ _difference(place, measurement.pose)
+        turn = rotation_between(place[1], measurement.pose.orientation)
+        correction = gain @ np.concatenate([measurement.pose.position - place[0], turn])
         turned = product(rotation_exp(correction[3:6]), place[1])
         self._place = place[0] + correction[:3], turned
         self._velocity = self._velocity + correction[_VELOCITY]
@@ -270,9 +255,3 @@ class ConstantVelocityKalman(PoseFilter):
         It settles as an alpha-beta tracker, whose error for a ramp is zero (Kalata 1984).
         """
         return 0.0
-
-
-def _difference(expected: _Place, measured: Pose) -> NDArray[np.float64]:
-    """(6,) m, rad, from one pose to another, as a measurement's covariance has them."""
-    turn = rotation_between(expected[1], measured.orientation)
-    return np.concatenate([measured.position - expected[0], turn])

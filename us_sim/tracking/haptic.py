@@ -28,13 +28,13 @@ from us_sim.geometry.pose import Pose, product
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.settings import HapticSettings
 
+Array = NDArray[np.float64]
+
 _FADING = 0.5  # fraction of the push at the model's pose below which the rest of the energy fades
 _FARTHEST = 0.03  # m: distance after which the push ends at the latest, however soft the tissue is
 
 
-def wrench_in_patient(
-    pose: Pose, force: NDArray[np.float64], torque: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def wrench_in_patient(pose: Pose, force: Array, torque: Array) -> Array:
     """(6,) N, N m: force and torque (3,) along the probe's axes, along those of ``patient``."""
     return np.concatenate([pose.rotation @ force, pose.rotation @ torque])
 
@@ -52,22 +52,18 @@ class ContactModel:
 
     stamp: int  # ns, of the pose
     pose: Pose  # of the probe in patient
-    wrench: NDArray[np.float64]  # (6,) N, N m, on the probe, about its origin, axes of patient
-    stiffness: NDArray[
-        np.float64
-    ]  # (6, 6) N/m, N, N m, symmetric, how the wrench falls with the motion
+    wrench: Array  # (6,) N, N m, on the probe, about its origin, axes of patient
+    stiffness: Array  # (6, 6) N/m, N, N m, symmetric: how the wrench falls with the motion
 
     @property
-    def push(self) -> NDArray[np.float64]:
+    def push(self) -> Array:
         """(3,) unit direction in which the tissue pushes the probe; zero without contact."""
         return self._split[0]
 
     @cached_property
     def _split(
         self,
-    ) -> tuple[
-        NDArray[np.float64], float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]
-    ]:
+    ) -> tuple[Array, float, Array, Array, Array]:
         """The push's direction (3,), N, and how it falls (6,); the rest's wrench (6,) and stiffness
         (6, 6)."""
         force = float(np.linalg.norm(self.wrench[:3]))
@@ -82,7 +78,7 @@ class ContactModel:
         rest = self.stiffness + lacking * np.outer(along, along) - np.outer(slope, shape)
         return direction, force, slope, self.wrench - force * shape, rest
 
-    def answer(self, displacement: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    def answer(self, displacement: Array) -> tuple[float, Array]:
         """The energy (J) and the wrench (6,) N, N m at a displacement (6,) m, rad."""
         energy, wrench = self._slope(displacement)
         turn = displacement[3:]
@@ -91,7 +87,7 @@ class ContactModel:
             wrench[3:] = np.linalg.solve(se3.left_jacobian(turn).T, wrench[3:])
         return energy, wrench
 
-    def _slope(self, d: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    def _slope(self, d: Array) -> tuple[float, Array]:
         """The energy (J) at a displacement (6,), and how it falls with that (6,)."""
         direction, force, slope, wrench, stiffness = self._split
         if force == 0.0:
@@ -100,7 +96,9 @@ class ContactModel:
         push = force - float(slope @ d)
         if push <= 0.0:
             return 0.0, np.zeros(6)
-        fade, fade_slope = _fade(push / force)
+        # The factor of the rest of the energy, and its slope with the push.
+        x = min(push / force / _FADING, 1.0)
+        fade, fade_slope = x * x * (3.0 - 2.0 * x), 6.0 * x * (1.0 - x) / _FADING
         pulled = wrench - stiffness @ d
         # At most what the spring along the push stored, or light contact would end with a kick.
         most = 0.5 * force * force / spring
@@ -110,14 +108,6 @@ class ContactModel:
         answer = (push / spring + fade_slope / force * rest) * slope
         answer += fade * (1.0 - part * part) * pulled
         return energy, answer
-
-
-def _fade(push: float) -> tuple[float, float]:
-    """The factor of the rest of the energy at a fraction of the push, and its slope."""
-    x = push / _FADING
-    if x >= 1.0:
-        return 1.0, 0.0
-    return x * x * (3.0 - 2.0 * x), 6.0 * x * (1.0 - x) / _FADING
 
 
 _QUEUED = 4096  # poses that wait for the next tick
@@ -177,7 +167,7 @@ class HapticRendering:
         self._left_over, self._since = np.zeros(6), 0  # wrench of earlier models, since when (ns)
         self._felt = np.zeros(6)
         self._motion = np.zeros(6)  # m, rad, of the handle since the last tick
-        self._motions: deque[NDArray[np.float64]] = deque(maxlen=_SMOOTHED)
+        self._motions: deque[Array] = deque(maxlen=_SMOOTHED)
         #: J, work done by the handle since contact began, less work done on it.
         self.energy = 0.0
         #: Why nothing is felt; '' while something may be.
@@ -207,7 +197,7 @@ class HapticRendering:
         """Stop, for a reason, because input cannot be used."""
         self._distrusted.append(why)
 
-    def render(self, now: int) -> NDArray[np.float64]:
+    def render(self, now: int) -> Array:
         """(6,) N, N m on the handle until the next tick, about its origin, axes of the arm.
 
         ``now`` is in ns of the clock of `pose` and `model`.
@@ -219,14 +209,23 @@ class HapticRendering:
             # Only models of poses from here on are believed.
             self._not_before = self.stamp
             return self._doubted(doubt)
-        doubt = self._take_model(now)
-        if doubt:
-            return self._doubted(doubt)
-        assert self._model is not None
+        if self._arrived_model:
+            self._adopt(*self._arrived_model.popleft())
+        if self._model is None:
+            return self._doubted("no model of the contact yet")
+        age = now - self._model_time
+        if age > 1e9 * self._settings.model_timeout:
+            return self._doubted(f"no model of the contact for {1e-6 * age:.0f} ms")
         moved = self._device.probe_moved(self._model.pose, self._anchor, self._handle.poses[-1])
-        doubt = self._far(moved)
-        if doubt:
-            return self._doubted(doubt)
+        distance, turn = _lengths(moved)
+        if distance > _REACH:
+            return self._doubted(
+                f"the probe is {1e3 * distance:.1f} mm from where the contact is known"
+            )
+        if turn > _ROTATION_REACH:
+            return self._doubted(
+                f"the probe is turned {math.degrees(turn):.0f}° from where the contact is known"
+            )
         self.doubt = ""
         if self._begun is None:
             self._begun = now
@@ -272,16 +271,6 @@ class HapticRendering:
             return f"no pose of the handle for {1e-6 * (now - self._pose_time):.0f} ms"
         return "the clutch is held" if self._is_clutched else ""
 
-    def _take_model(self, now: int) -> str:
-        """Take the newest model if it belongs to a pose; returns a doubt, or an empty text."""
-        if self._arrived_model:
-            self._adopt(*self._arrived_model.popleft())
-        if self._model is None:
-            return "no model of the contact yet"
-        if now - self._model_time > 1e9 * self._settings.model_timeout:
-            return f"no model of the contact for {1e-6 * (now - self._model_time):.0f} ms"
-        return ""
-
     def _adopt(self, model: ContactModel, time: int) -> None:
         """Change to a newer model, if it is known where the handle was."""
         stamp = model.stamp - self._time_offset
@@ -301,16 +290,7 @@ class HapticRendering:
         self._model, self._anchor, self._model_time = model, anchor, time
         self._not_before = stamp
 
-    def _far(self, moved: NDArray[np.float64]) -> str:
-        """A doubt about a model made at a displacement (6,) m, rad, or an empty text."""
-        distance, turn = _lengths(moved)
-        if distance > _REACH:
-            return f"the probe is {1e3 * distance:.1f} mm from where the contact is known"
-        if turn > _ROTATION_REACH:
-            return f"the probe is turned {math.degrees(turn):.0f}° from where the contact is known"
-        return ""
-
-    def _doubted(self, doubt: str) -> NDArray[np.float64]:
+    def _doubted(self, doubt: str) -> Array:
         """Return a wrench of zero, and begin anew with the next model."""
         if not self.doubt:
             self.stopped = doubt
@@ -324,12 +304,12 @@ class HapticRendering:
         self.energy = min(self.energy, 0.0)  # energy returned in excess is still owed
         return np.zeros(6)
 
-    def _left(self, now: int) -> NDArray[np.float64]:
+    def _left(self, now: int) -> Array:
         """(6,) N, N m, the remainder of earlier models."""
         fraction = 1.0 - 1e-9 * (now - self._since) / self._settings.hand_over
         return self._left_over * min(max(fraction, 0.0), 1.0)
 
-    def _unilateral(self, felt: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _unilateral(self, felt: Array) -> Array:
         """The wrench, less a force that would pull the handle against the tissue's push."""
         assert self._model is not None
         push = self._device.direction_on_handle(self._model.push)
@@ -338,7 +318,7 @@ class HapticRendering:
             felt[:3] -= pulled * push
         return felt
 
-    def _limited(self, felt: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _limited(self, felt: Array) -> Array:
         """The wrench within the limits of the arm."""
         force, torque = _lengths(felt)
         if force > self._settings.force_limit:
@@ -347,7 +327,7 @@ class HapticRendering:
             felt[3:] *= self._settings.torque_limit / torque
         return felt
 
-    def _passive(self, felt: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _passive(self, felt: Array) -> Array:
         """The wrench, less the part along the motion that would return too much energy."""
         motion = sum(self._motions) / len(self._motions)
         work = float(felt @ motion)
@@ -365,13 +345,13 @@ class HapticRendering:
         return self._limited(self._unilateral(felt - off * self._metric * direction))
 
 
-def _motion(first: Pose, second: Pose) -> NDArray[np.float64]:
+def _motion(first: Pose, second: Pose) -> Array:
     """(6,) m, rad, from one pose of the handle to another, along the axes of the arm."""
     turn = se3.rotation_between(first.orientation, second.orientation)
     return np.concatenate([second.position - first.position, turn])
 
 
-def _lengths(pair: NDArray[np.float64]) -> tuple[float, float]:
+def _lengths(pair: Array) -> tuple[float, float]:
     """The norms of the first and of the last three numbers."""
     a, b, c, d, e, f = pair.tolist()
     return math.sqrt(a * a + b * b + c * c), math.sqrt(d * d + e * e + f * f)
@@ -435,7 +415,7 @@ class HapticDevice:
         turned = product(pose.orientation, self._regrip)
         return Pose(self._scale * pose.position + self._offset, turned)
 
-    def probe_moved(self, probe: Pose, before: Pose, now: Pose) -> NDArray[np.float64]:
+    def probe_moved(self, probe: Pose, before: Pose, now: Pose) -> Array:
         """How the probe moves with the handle, whatever the clutch did earlier.
 
         Args:
@@ -453,9 +433,7 @@ class HapticDevice:
             moved[:3] += _turned(arm, moved[3:]) - arm
         return moved
 
-    def on_handle(
-        self, probe: Pose, turn: NDArray[np.float64], wrench: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def on_handle(self, probe: Pose, turn: Array, wrench: Array) -> Array:
         """(6,) N, N m on the handle, about its origin along the axes of the arm.
 
         Its work is that of the wrench on the probe times `work_ratio`: what takes no energy there
@@ -475,11 +453,11 @@ class HapticDevice:
         felt[3:] = self.work_ratio * (torque @ self._turn)
         return felt
 
-    def direction_on_handle(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    def direction_on_handle(self, direction: Array) -> Array:
         """(3,) along the axes of the arm, of (3,) along those of ``patient``."""
         return direction @ self._turn
 
 
-def _turned(vector: NDArray[np.float64], turn: NDArray[np.float64]) -> NDArray[np.float64]:
+def _turned(vector: Array, turn: Array) -> Array:
     """A vector (3,), turned by a rotation vector (3,) rad."""
     return Pose(orientation=se3.rotation_exp(turn)).rotation @ vector

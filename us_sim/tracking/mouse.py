@@ -53,7 +53,7 @@ class SixDofMouse:
         self._held: dict[int, bool] = {}
 
     def axes(self, axes: Sequence[float], buttons: Sequence[int], stamp: int) -> Measurement | None:
-        """The probe after a message, or None where it cannot be used: `last_problem` says why.
+        """Move the probe by a message; None where that cannot be used: `last_problem` says why.
 
         Args:
             axes: deflections in ±1.
@@ -64,7 +64,10 @@ class SixDofMouse:
         deflection = self._deflection(axes)
         if deflection is None:
             return None
-        step, before = self._step(stamp), self._twist
+        step = 0.0 if self._stamp is None else 1e-9 * (stamp - self._stamp)
+        if not 0.0 <= step <= _LONGEST_GAP:  # after a long gap, or where stamps jump back
+            step = 0.0
+        before = self._twist
         self._stamp, self._twist = stamp, self._full * deflection
         clutch, home = (
             self._is_held(button, buttons)
@@ -74,11 +77,13 @@ class SixDofMouse:
             self.pose = self._home
         elif not clutch:
             # The velocity goes evenly from the last message's to this one's.
-            self.pose = self._within(self._moved(self.pose, 0.5 * step * (before + self._twist)))
+            pose = self._moved(self.pose, 0.5 * step * (before + self._twist))
+            low, high = self._settings.workspace_low, self._settings.workspace_high
+            self.pose = Pose(np.clip(pose.position, low, high), pose.orientation)
         return Measurement(stamp, self.pose)
 
     def _deflection(self, axes: Sequence[float]) -> NDArray[np.float64] | None:
-        """(6,) deflections of the axes used, counted from the edge of the dead band."""
+        """Return the (6,) deflections of the axes used, counted from the edge of the dead band."""
         last = max(self._used)
         if len(axes) <= last:
             self.last_problem = (
@@ -101,30 +106,18 @@ class SixDofMouse:
         past = np.clip((np.abs(deflection) - band) / (1.0 - band), 0.0, 1.0)
         return np.copysign(past, deflection)
 
-    def _step(self, stamp: int) -> float:
-        """s since the last message; 0 after a long gap, or where stamps jump back."""
-        if self._stamp is None:
-            return 0.0
-        step = 1e-9 * (stamp - self._stamp)
-        return step if 0.0 < step <= _LONGEST_GAP else 0.0
-
     def _is_held(self, button: int, buttons: Sequence[int]) -> bool:
         if 0 <= button < len(buttons):
             self._held[button] = bool(buttons[button])
         return self._held.get(button, False)
 
     def _moved(self, pose: Pose, twist: NDArray[np.float64]) -> Pose:
-        """The pose after a motion (6,) m, rad that is uniform in the frame of motion."""
+        """Move a pose by (6,) m, rad, uniformly in the frame of motion."""
         if self._settings.frame == "probe":
             return pose @ se3.exp(twist)
         # Along the patient's axes, and turned about the probe's face.
         turn = product(se3.rotation_exp(twist[3:]), pose.orientation)
         return Pose(pose.position + twist[:3], turn)
-
-    def _within(self, pose: Pose) -> Pose:
-        """The pose, in the workspace."""
-        low, high = self._settings.workspace_low, self._settings.workspace_high
-        return Pose(np.clip(pose.position, low, high), pose.orientation)
 
 
 FULL_DEFLECTION = 350.0  # the largest number that the device reports
@@ -143,7 +136,9 @@ class SpaceMouseReports:
     """The state of a device, from the reports that it sends when something changes."""
 
     def __init__(self) -> None:
+        #: Six deflections in ±1: forward, left, up, and turns about these.
         self.axes = [0.0] * 6
+        #: 1 for each that is pressed.
         self.buttons = [0, 0]
 
     def take(self, report: bytes) -> bool:
@@ -173,7 +168,7 @@ class SpaceMouseReports:
                 self.axes[axis] = max(-1.0, min(1.0, value)) + 0.0  # without a negative zero
 
 
-class SpaceMouse:
+class SpaceMouse(SpaceMouseReports):
     """The first SpaceMouse that is plugged in.
 
     Raises:
@@ -181,7 +176,14 @@ class SpaceMouse:
     """
 
     def __init__(self) -> None:
-        hid = _hidapi()
+        super().__init__()
+        try:
+            import hid
+        except ImportError as error:
+            raise TrackingError(
+                f"a SpaceMouse needs the library hidapi ({error}): pip install "
+                f"'us_sim[space_mouse]'"
+            ) from error
         found = [entry for entry in hid.enumerate() if _is_space_mouse(entry)]
         if not found:
             raise TrackingError("no SpaceMouse is plugged in: plug it in, or pair it")
@@ -197,17 +199,6 @@ class SpaceMouse:
                 f"device (Linux: a udev rule for vendor {found[0]['vendor_id']:04x}), or end the "
                 f"program that uses it"
             ) from error
-        self._reports = SpaceMouseReports()
-
-    @property
-    def axes(self) -> list[float]:
-        """Six deflections in ±1: forward, left, up, and turns about these."""
-        return list(self._reports.axes)
-
-    @property
-    def buttons(self) -> list[int]:
-        """1 for each that is pressed."""
-        return list(self._reports.buttons)
 
     def wait(self, seconds: float) -> bool:
         """Take the next report, if one comes in time; whether something has changed.
@@ -219,21 +210,11 @@ class SpaceMouse:
             report = self._device.read(_REPORT_BYTES, max(round(seconds * 1e3), 1))
         except (OSError, ValueError) as error:
             raise TrackingError(f"{self.name} is gone ({error}): plug it in again") from error
-        return self._reports.take(bytes(report))
+        return self.take(bytes(report))
 
     def close(self) -> None:
         """Let go of the device."""
         self._device.close()
-
-
-def _hidapi() -> Any:
-    try:
-        import hid
-    except ImportError as error:
-        raise TrackingError(
-            f"a SpaceMouse needs the library hidapi ({error}): pip install 'us_sim[space_mouse]'"
-        ) from error
-    return hid
 
 
 def _is_space_mouse(entry: dict[str, Any]) -> bool:

@@ -215,18 +215,11 @@ def _checksum(body: bytes) -> int:
     return int(_crc64(np.frombuffer(body, dtype=np.uint8), _CRC_TABLE))
 
 
-def _crc_table() -> NDArray[np.uint64]:
-    """Checksums of single bytes: CRC-64 of ECMA-182, most significant bit first."""
-    table = np.empty(256, dtype=np.uint64)
-    for byte in range(256):
-        crc = byte << 56
-        for _ in range(8):
-            crc = (crc << 1 ^ (0x42F0E1EBA9EA3693 if crc >> 63 else 0)) & (2**64 - 1)
-        table[byte] = crc
-    return table
-
-
-_CRC_TABLE = _crc_table()
+# Checksums of single bytes: CRC-64 of ECMA-182, most significant bit first.
+_CRC_TABLE = np.arange(256, dtype=np.uint64) << np.uint64(56)
+for _ in range(8):
+    _divisor = np.where(_CRC_TABLE >> np.uint64(63), np.uint64(0x42F0E1EBA9EA3693), np.uint64(0))
+    _CRC_TABLE = _CRC_TABLE << np.uint64(1) ^ _divisor
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -336,7 +329,7 @@ class OpenIGTLinkClient:
                 continue
             self._heard = time.monotonic()
             try:
-                pose = self._in_metres(matrix)
+                pose = Pose.from_matrix(matrix)
             except PoseError as error:
                 self._problem("pose", f"{self.place}: {name}: {error}; it is not used")
                 continue
@@ -354,6 +347,8 @@ class OpenIGTLinkClient:
                         f"set tracker.openigtlink.clock in the scene to arrival",
                     )
                     continue
+            if self._settings.world == "ras":
+                pose = LPS_FROM_RAS @ pose
             self._take(Measurement(header.stamp, pose))
 
     def _is_wanted(self, name: str) -> bool:
@@ -375,10 +370,6 @@ class OpenIGTLinkClient:
                 f"of {', '.join(self._names)}",
             )
         return False
-
-    def _in_metres(self, matrix: NDArray[np.float64]) -> Pose:
-        pose = Pose.from_matrix(matrix)
-        return LPS_FROM_RAS @ pose if self._settings.world == "ras" else pose
 
 
 def _read(stream: BinaryIO, size: int) -> bytes:

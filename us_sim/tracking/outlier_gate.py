@@ -13,10 +13,9 @@
 from __future__ import annotations
 
 from enum import Enum
-from math import degrees, sqrt
+from math import degrees, hypot, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from us_sim.geometry.se3 import rotation_between
 from us_sim.tracking.measurement import Measurement
@@ -64,11 +63,15 @@ class OutlierGate:
         self.reason = ""
 
     def judge(self, measurement: Measurement) -> Verdict:
-        """Whether a measurement, newer than any before, is believed; if not, `reason` says why."""
+        """Judge a measurement newer than any before; if it is refused, `reason` says why."""
         self.reason = self._doubt(measurement)
         verdict = Verdict.BELIEVED
         if self.reason:
-            self._row = self._row + 1 if self._agrees(measurement) else 1
+            before = self._refused
+            agrees = before is not None and not self._too_fast(
+                before, measurement, 1e-9 * (measurement.stamp - before.stamp)
+            )
+            self._row = self._row + 1 if agrees else 1
             self._refused = measurement
             if self._row < min(self._settings.accept_after, self._support + 1):
                 return Verdict.REFUSED
@@ -77,19 +80,16 @@ class OutlierGate:
         self._believed, self._refused, self._row = measurement, None, 0
         return verdict
 
-    def _agrees(self, measurement: Measurement) -> bool:
-        """Whether the probe can have come to a measurement from the refused one before it."""
-        before = self._refused
-        if before is None:
-            return False
-        return not self._too_fast(before, measurement, 1e-9 * (measurement.stamp - before.stamp))
-
     def _doubt(self, measurement: Measurement) -> str:
-        """Why a measurement is not believed, or nothing."""
+        """Say why a measurement is not believed; nothing if it is."""
         before = self._believed
         if before is None:
             return ""
-        step = self._time_to_move(before, measurement)
+        nanoseconds = measurement.stamp - before.stamp
+        if self._refused is not None:
+            newest = measurement.stamp - self._refused.stamp
+            nanoseconds = min(nanoseconds, self._settings.accept_after * newest)
+        step = 1e-9 * nanoseconds
         if before.covariance is None or measurement.covariance is None:
             return self._too_fast(before, measurement, step)
         settings = self._settings
@@ -103,31 +103,23 @@ class OutlierGate:
         if 0.0 <= distance <= _LIMIT:
             return ""
         return (
-            f"the pose is {1e3 * _norm(difference[:3]):.1f} mm and "
-            f"{degrees(_norm(difference[3:])):.1f}° from the one before: "
+            f"the pose is {1e3 * hypot(*difference[:3]):.1f} mm and "
+            f"{degrees(hypot(*difference[3:])):.1f}° from the one before: "
             f"Mahalanobis distance {sqrt(max(distance, 0.0)):.1f}, the limit is "
             f"{sqrt(_LIMIT):.1f}"
         )
 
-    def _time_to_move(self, before: Measurement, measurement: Measurement) -> float:
-        """s that the probe has had since a believed measurement, see the class."""
-        step = measurement.stamp - before.stamp
-        if self._refused is not None:
-            newest = measurement.stamp - self._refused.stamp
-            step = min(step, self._settings.accept_after * newest)
-        return 1e-9 * step
-
     def _too_fast(self, before: Measurement, measurement: Measurement, step: float) -> str:
-        """Why a probe cannot have come from one pose to another in a time (s), or nothing."""
+        """Say why a probe cannot have come from one pose to another in a time (s), or nothing."""
         settings, elapsed = self._settings, 1e-6 * (measurement.stamp - before.stamp)
-        distance = _norm(measurement.pose.position - before.pose.position)
+        distance = hypot(*(measurement.pose.position - before.pose.position))
         limit = settings.jump + settings.maximum_speed * step
         if distance > limit:
             return (
                 f"the pose is {1e3 * distance:.1f} mm from the one {elapsed:.1f} ms before, where "
                 f"{1e3 * limit:.1f} mm are believed"
             )
-        turn = _norm(rotation_between(before.pose.orientation, measurement.pose.orientation))
+        turn = hypot(*rotation_between(before.pose.orientation, measurement.pose.orientation))
         limit = settings.rotation_jump + settings.maximum_angular_speed * step
         if turn > limit:
             return (
@@ -135,7 +127,3 @@ class OutlierGate:
                 f"where {degrees(limit):.1f}° are believed"
             )
         return ""
-
-
-def _norm(vector: NDArray[np.float64]) -> float:
-    return sqrt(float(vector @ vector))

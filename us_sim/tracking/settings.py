@@ -196,8 +196,6 @@ class HapticSettings(Settings):
     )
 
 
-MOTION_FRAMES = ("probe", "patient")
-
 _PLACE = Quantity("length", -10.0, 10.0)
 _BUTTON = Quantity("number", -1, 63)
 
@@ -215,7 +213,9 @@ class SixDofMouseSettings(Settings):
     error = TrackingError
 
     frame: str = setting(
-        description="whose axes the probe moves along", choices=MOTION_FRAMES, default="probe"
+        description="whose axes the probe moves along",
+        choices=("probe", "patient"),
+        default="probe",
     )
     axes: tuple[int, int, int, int, int, int] = setting(
         Quantity("number", 0, 63),
@@ -271,10 +271,6 @@ class SixDofMouseSettings(Settings):
             )
 
 
-WORLDS = ("tracker", "lps", "ras")
-CLOCKS = ("server", "arrival")
-
-
 @dataclass(frozen=True)
 class OpenIGTLinkSettings(Settings):
     """The settings of the connection; each is a key of a scene's ``tracker.openigtlink:``.
@@ -290,13 +286,13 @@ class OpenIGTLinkSettings(Settings):
     world: str = setting(
         description="what the poses are in: the tracker's own frame, or an image's LPS or RAS; "
         "RAS, which 3D Slicer sends, is turned into LPS, in which volumes are read",
-        choices=WORLDS,
+        choices=("tracker", "lps", "ras"),
         default="tracker",
     )
     clock: str = setting(
         description="server: the messages' own stamps; arrival: when they come, for a server "
         "whose clock is not this computer's",
-        choices=CLOCKS,
+        choices=("server", "arrival"),
         default="server",
     )
     tracking_data: bool = setting(

@@ -22,10 +22,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from us_sim.errors import MeshError, PoseError
 from us_sim.geometry.pose import Pose, product
-from us_sim.geometry.se3 import rotation_exp
 
 _TURNS, _NEAR = 30, 1e-9
 """How often the foot of a perpendicular is improved at most, and how far (m) it may then be off."""
@@ -101,7 +101,7 @@ class RestSurface:
         return cls(vertices, triangles[faces_up])
 
     def closest(self, point: NDArray[np.float64]) -> Foot:
-        """The surface's closest point to one (3,) m."""
+        """Find the surface's closest point to one (3,) m."""
         offsets = self._centres - point
         distances = np.sqrt(np.einsum("tx,tx->t", offsets, offsets))
         # No other triangle's sphere comes as near as the nearest centre.
@@ -113,7 +113,7 @@ class RestSurface:
         return self._foot(int(near[best]), weights[best])
 
     def above(self, x: float, y: float) -> Foot:
-        """The point of the surface's top at x, y (m), or near it where there is none.
+        """Find the point of the surface's top at x, y (m), or near it where there is none.
 
         It is the closest to a point on the line along z, which then is put on its tangent plane.
         """
@@ -128,7 +128,7 @@ class RestSurface:
         return foot
 
     def under(self, position: NDArray[np.float64]) -> tuple[Foot, float]:
-        """The foot on whose normal a position (3,) m lies, and how far inwards (m) it is from it.
+        """Find the foot on whose normal a position (3,) m lies, and how far inwards (m) that is.
 
         Near the edge of a surface that is not closed there may be none: then it is the closest.
         """
@@ -192,13 +192,13 @@ class Approach:
         self.goal: NDArray[np.float64] = self.place.copy()
 
     def distance(self) -> float:
-        """How far it, or its lead, still is from the goal."""
-        return max(_norm(self.goal - self._lead), _norm(self.goal - self.place))
+        """Return how far it, or its lead, still is from the goal."""
+        return max(math.dist(self.goal, self._lead), math.dist(self.goal, self.place))
 
     def advance(self, seconds: float) -> NDArray[np.float64]:
-        """(K,) the place, so many seconds later."""
+        """Advance by seconds, and return the place (K,)."""
         way = self.goal - self._lead
-        distance, tau = _norm(way), self._time_constant
+        distance, tau = math.hypot(*way), self._time_constant
         fast = max(distance / self._speed - tau, 0.0)  # s until the lead slows down
         if fast > 0.0:
             passed = min(seconds, fast)
@@ -212,10 +212,6 @@ class Approach:
             self.place = self.goal + decay * (self.place - self.goal - (seconds / tau) * way)
             self._lead = self.goal - decay * way
         return self.place
-
-
-def _norm(vector: NDArray[np.float64]) -> float:
-    return math.sqrt(float(vector @ vector))
 
 
 _AT_REST, _ALIGNED = 2e-6, 1e-4  # m and rad from the goal: it is reached, for a pixel is some 80 µm
@@ -266,7 +262,7 @@ class Motion:
         self._turn.goal = turn
 
     def advance(self, seconds: float) -> Stance:
-        """The stance so many seconds later."""
+        """Advance by seconds, and return the stance."""
         for approach in self._approaches:
             approach.advance(seconds)
         return self.stance
@@ -287,6 +283,7 @@ def _stance(
 
 DEEPEST = 0.02  # m that a probe is pressed at most: a vein closes at half of it, and deeper hurts
 HIGHEST = 0.05  # m that it is lifted off at most
+_ORDER = "ZXY"  # of rotation, fan and rock, each about the probe's axis as those before left it
 STEEPEST = math.radians(60)
 """rad that it is fanned or rocked at most: more, and its grip would lie on the skin."""
 
@@ -318,20 +315,15 @@ class Stance:
 
     @classmethod
     def of(cls, pose: Pose, surface: RestSurface) -> Stance:
-        """The stance of a probe that is somewhere already: the way back from `pose`."""
+        """Find the stance of a probe that is somewhere already: the way back from `pose`."""
         foot, press = surface.under(pose.position)
         x, y, z, w = _upright(foot.normal)
-        turned = Pose(np.zeros(3), product(np.array([-x, -y, -z, w]), pose.orientation)).rotation
-        # Rz(rotation) Rx(fan) Ry(rock), taken apart (Diebel 2006, sequence 3-1-2).
-        fan = math.asin(float(np.clip(turned[2, 1], -1.0, 1.0)))
-        if math.hypot(turned[0, 1], turned[1, 1]) < 1e-9:  # fanned by a quarter turn
-            return cls(foot.point, press, math.atan2(turned[1, 0], turned[0, 0]), fan, 0.0)
-        rotation = math.atan2(-turned[0, 1], turned[1, 1])
-        return cls(foot.point, press, rotation, fan, math.atan2(-turned[2, 0], turned[2, 2]))
+        turned = Rotation.from_quat(product(np.array([-x, -y, -z, w]), pose.orientation))
+        return cls(foot.point, press, *turned.as_euler(_ORDER).tolist())
 
     @classmethod
     def home(cls, surface: RestSurface, press: float) -> Stance:
-        """Upright above the origin of ``patient``, or on the middle of a surface that is not there;
+        """Stand upright above the origin of ``patient``, or on the middle of a surface not there;
         ``press`` in m.
         """
         middle = 0.5 * (surface.lower + surface.upper)
@@ -340,22 +332,21 @@ class Stance:
         return cls(surface.above(x, y).point, press)
 
     def pose(self, surface: RestSurface) -> Pose:
-        """The probe in ``patient``, held so."""
+        """Return the pose of the probe in ``patient``."""
         foot = surface.closest(self.point)
-        orientation = product(_upright(foot.normal), rotation_exp(_about(2, self.rotation)))
-        orientation = product(orientation, rotation_exp(_about(0, self.fan)))
-        orientation = product(orientation, rotation_exp(_about(1, self.rock)))
+        turn = Rotation.from_euler(_ORDER, [self.rotation, self.fan, self.rock]).as_quat()
+        orientation = product(_upright(foot.normal), turn)
         return Pose(foot.point - self.press * foot.normal, orientation)
 
     def slid(self, surface: RestSurface, along_x: float, along_y: float) -> Stance:
-        """Moved along the probe's own x and y, m, as it is rotated, to the closest of the skin."""
+        """Slide along the probe's own x and y, m, as it is rotated, to the closest of the skin."""
         foot = surface.closest(self.point)
-        turned = product(_upright(foot.normal), rotation_exp(_about(2, self.rotation)))
-        way = Pose(np.zeros(3), turned).rotation @ np.array([along_x, along_y, 0.0])
+        way = Rotation.from_euler("Z", self.rotation).apply([along_x, along_y, 0.0])
+        way = Rotation.from_quat(_upright(foot.normal)).apply(way)
         return replace(self, point=surface.closest(foot.point + way).point)
 
     def within_reach(self) -> Stance:
-        """Pressed and turned no further than a hand may."""
+        """Press and turn no further than a hand may."""
         return replace(
             self,
             press=min(max(self.press, -HIGHEST), DEEPEST),
@@ -366,15 +357,8 @@ class Stance:
 
 
 def half_turn(angle: float) -> float:
-    """The same angle (rad) within half a turn to either side."""
+    """Bring an angle (rad) within half a turn to either side."""
     return math.remainder(angle, 2.0 * math.pi)
-
-
-def _about(axis: int, angle: float) -> NDArray[np.float64]:
-    """(3,) rad, the rotation vector of a turn about one axis."""
-    vector = np.zeros(3)
-    vector[axis] = angle
-    return vector
 
 
 def _upright(normal: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ import pytest
 from us_sim.command.main import main
 from us_sim.errors import TrackingError
 from us_sim.share import shared_path
-from us_sim.tracking.camera.fiducial_detector import detect_corners
+from us_sim.tracking.camera.fiducial_detector import FiducialDetector
 from us_sim.tracking.camera.marker_print import print_markers, sheets
 from us_sim.tracking.camera.rigid_body import RigidBody
 
@@ -36,7 +36,8 @@ def dots_per_metre(path):
 def test_a_printed_body_has_its_size(body, tmp_path):
     path = tmp_path / "sheet.png"
     print_markers(body, path)
-    points, pixels = detect_corners(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), body)
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    points, pixels, _ = FiducialDetector(body).detect(image).correspondences(body)
     wanted = len(body.ids) * 4 if body.chessboard is None else len(body.chessboard.corners)
     assert len(points) == wanted
     printed = pixels / dots_per_metre(path)
@@ -51,8 +52,8 @@ def test_markers_of_a_body_that_is_not_flat_are_printed_one_by_one():
     corners += np.arange(20.0)[:, None, None] * [0.0, 0.0, 0.01]
     pages = sheets(RigidBody("4X4_50", np.arange(20), corners))
     # With their margins two of 66.7 mm go beside each other, and three of these rows on a sheet.
-    ids = [tuple(range(first, min(first + 6, 20))) for first in (0, 6, 12, 18)]
-    assert [page.ids for page in pages] == ids
+    numbers = [list(range(first, min(first + 6, 20))) for first in (0, 6, 12, 18)]
+    assert [[int(text) for *_, text in page.labels] for page in pages] == numbers
     for page in pages:
         edges = np.roll(page.marked, -1, axis=1) - page.marked
         assert np.allclose(np.linalg.norm(edges, axis=2), 50.0)

@@ -12,7 +12,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.tracking.camera.body_pose import rotation_angle
 from us_sim.tracking.camera.corner_refinement import refined_corners
 from us_sim.tracking.camera.encodings import decode_image
-from us_sim.tracking.camera.fiducial_detector import FiducialDetector, detect_corners
+from us_sim.tracking.camera.fiducial_detector import FiducialDetector
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rendered_views import Conditions, RenderedView
 from us_sim.tracking.camera.rigid_body import RigidBody
@@ -172,7 +172,8 @@ def test_a_covered_edge_is_not_guessed(image):
 
 def test_corners_are_exact_to_a_tenth_of_a_pixel(scene):
     for true in random_views(10, 0.4, (0.0, 60.0), seed=9):
-        points, pixels = detect_corners(scene.render(true, ORDINARY), MARKER)
+        seen = FiducialDetector(MARKER).detect(scene.render(true, ORDINARY))
+        points, pixels, _ = seen.correspondences(MARKER)
         assert np.abs(pixels - WEBCAM.project(true.apply(points))).max() < 0.1
 
 
@@ -204,7 +205,8 @@ def test_every_photo_of_a_board_shows_its_corners(
 ):
     files = sorted(shared_data.glob(photos))
     assert len(files) == count
-    seen = [detect_corners(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), board) for file in files]
+    images = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]
+    seen = [FiducialDetector(board).detect(image).correspondences(board)[:2] for image in images]
     assert all(len(points) in corners for points, _ in seen)
     points, pixels = ([np.float32(each) for each in part] for part in zip(*seen, strict=True))
     assert cv2.calibrateCamera(points, pixels, (640, 480), None, None)[0] < residual

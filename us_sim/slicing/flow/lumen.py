@@ -116,8 +116,16 @@ def lumen_of(lumen: NDArray[np.bool_], index_to_patient: NDArray[np.float64]) ->
     for _ in range(_REFINED):
         points = _extended(points, walls, 0.25 * line.width)
         section = _sections(points, walls, closed=False)
-        points = resampled(_centroids(section), 0.25 * line.width, smoothing=0.5 * line.width)
-    found = _without_caps(_sections(_extended(points, walls, 0.25 * line.width), walls))
+        # Of the sector of a circle the centre of area lies two thirds out.
+        weights = section.radii**2
+        moment = np.einsum("sd,sdx->sx", weights, section._wall) * (2.0 / 3.0)
+        centroids = section.centres + moment / np.maximum(weights.sum(axis=1), 1e-30)[:, None]
+        points = resampled(centroids, 0.25 * line.width, smoothing=0.5 * line.width)
+    tube = _sections(_extended(points, walls, 0.25 * line.width), walls)
+    # Without the stations at its ends where it closes.
+    wide = np.flatnonzero(tube.areas > 0.5 * np.median(tube.areas))
+    part = slice(int(wide[0]), int(wide[-1]) + 1)
+    found = Lumen(tube.centres[part], tube.tangents[part], tube.across[part], tube.radii[part])
     held = found.areas.sum() * found.spacing
     whole = len(inside) * abs(np.linalg.det(index_to_patient[:3, :3]))
     if not _HELD[0] < held / whole < _HELD[1]:
@@ -216,14 +224,6 @@ def _sections(points: NDArray[np.float64], walls: _Walls, *, closed: bool = True
     return Lumen(points, tangents, across, radii)
 
 
-def _centroids(lumen: Lumen) -> NDArray[np.float64]:
-    """(S, 3) m, the centres of area of the sections."""
-    # Of the sector of a circle it lies two thirds out.
-    weights = lumen.radii**2
-    moment = np.einsum("sd,sdx->sx", weights, lumen._wall) * (2.0 / 3.0)
-    return np.asarray(lumen.centres + moment / np.maximum(weights.sum(axis=1), 1e-30)[:, None])
-
-
 def _frames(tangents: NDArray[np.float64]) -> NDArray[np.float64]:
     """(S, 2, 3) unit vectors across tangents (S, 3), turned as little as possible in between."""
     across = np.empty((len(tangents), 2, 3))
@@ -244,13 +244,6 @@ def _extended(points: NDArray[np.float64], walls: _Walls, spacing: float) -> NDA
         out = ~walls.are_in_volume(ahead)
         ends.append(ahead[: np.argmax(out)] if out.any() else ahead)
     return np.concatenate([ends[0][::-1], points, ends[1]])
-
-
-def _without_caps(lumen: Lumen) -> Lumen:
-    """The lumen without the stations at its ends where it closes."""
-    wide = np.flatnonzero(lumen.areas > 0.5 * np.median(lumen.areas))
-    kept = slice(int(wide[0]), int(wide[-1]) + 1)
-    return Lumen(lumen.centres[kept], lumen.tangents[kept], lumen.across[kept], lumen.radii[kept])
 
 
 def _between(values: NDArray[np.float64], station: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from us_sim.cache import Form, kept
+from us_sim.cache import kept
 from us_sim.errors import SceneError, VolumeError
 from us_sim.kernels import njit
 from us_sim.slicing.flow.lumen import DIRECTIONS, Lumen, lumen_of
@@ -159,7 +159,7 @@ def mapped_lumen(volume: Volume, label: int) -> tuple[Lumen, LumenMap]:
         lumen = lumen_of(inside, volume.index_to_patient)
         return lumen, _map(lumen, inside, volume.index_to_patient)
 
-    return kept(f"lumen-{about.hexdigest()[:16]}", _FORM, make)
+    return kept(f"lumen-{about.hexdigest()[:16]}", _pack, _unpack, make)
 
 
 def _map(lumen: Lumen, inside: NDArray[np.bool_], to_patient: NDArray[np.float64]) -> LumenMap:
@@ -191,7 +191,6 @@ def _unpack(arrays: dict[str, NDArray], _: dict[str, Any]) -> tuple[Lumen, Lumen
 
 _OF_LUMEN = ("centres", "tangents", "across", "radii")
 _OF_MAP = ("station", "offset", "corner")
-_FORM = Form("lumen.json", _pack, _unpack)
 
 
 _ALONG = 0.25  # least cosine between the direction that is set and the vessel's own

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from us_sim.cache import Form, kept
+from us_sim.cache import kept
 from us_sim.errors import SolverError
 from us_sim.kernels import njit
 from us_sim.tissue.elasticity.linear_tetrahedra import (
@@ -204,7 +204,7 @@ def surface_compliance(
         )
     if not _KEPT <= 9 * touched * free <= _MOST_KEPT:
         return _compute(model, progress, has_error)
-    return kept(_key(model), _FORM, lambda: _compute(model, progress))
+    return kept(_key(model), _pack, _unpack, lambda: _compute(model, progress))
 
 
 def loaded_displacement(model: TissueModel) -> NDArray[np.float64]:
@@ -350,6 +350,3 @@ def _unpack(arrays: dict[str, NDArray], facts: dict[str, Any]) -> SurfaceComplia
         gram=arrays["gram"],
         rounding=float(facts["rounding"]),
     )
-
-
-_FORM = Form("compliance.json", _pack, _unpack)

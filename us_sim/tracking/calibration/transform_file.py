@@ -26,26 +26,20 @@ from typing import Any
 import numpy as np
 import yaml
 
-from us_sim.errors import CalibrationError, PoseError
+from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Placement, Pose
 from us_sim.settings.reading import Reader
-from us_sim.settings.text_files import YamlError, load_yaml
+from us_sim.settings.text_files import read_yaml
 
 
 def read_transform(path: str | Path) -> Pose:
-    """The pose of the file's frame `from` in its frame `to`, m.
+    """Read the pose of the file's frame `from` in its frame `to`, m.
 
     Raises:
         CalibrationError: the file is missing, is no YAML, lacks the position or orientation, or
             these are not 3 and 4 finite numbers.
     """
-    path = Path(path)
-    try:
-        document = load_yaml(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (PoseError, UnicodeDecodeError, YamlError) as error:
-        raise CalibrationError(f"{path}: {error}") from error
+    document = read_yaml(Path(path), CalibrationError)
     keys = ("position", "orientation")
     if not isinstance(document, dict) or not document.keys() >= set(keys):
         raise CalibrationError(

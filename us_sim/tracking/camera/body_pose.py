@@ -32,9 +32,10 @@ _TURN = cv2.Rodrigues(np.array([0.3, 0.5, 0.7]))[0]
 marker that faces the camera has."""
 
 
-def plane_poses(
-    points: NDArray[np.float64], rays: NDArray[np.float64]
-) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+_Guess = tuple[NDArray[np.float64], NDArray[np.float64]]  # rotation (3, 3), position (3,) m
+
+
+def plane_poses(points: NDArray[np.float64], rays: NDArray[np.float64]) -> list[_Guess]:
     """Rotations (3, 3) and positions (3,) m that take points in a plane before their rays.
 
     OpenCV's SQPNP, which needs no plane, gives one of the two poses only.
@@ -205,9 +206,6 @@ def rotation_angle(one: Pose, other: Pose) -> float:
     """rad, of the rotation from one pose to another."""
     cosine = abs(float(one.orientation @ other.orientation))
     return 2.0 * float(np.arccos(min(1.0, cosine)))
-
-
-_Guess = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def _guesses(

@@ -44,7 +44,7 @@ class Detection:
     def correspondences(
         self, body: RigidBody
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-        """Points of the body (N, 3) m, of the image (N, 2) pixels, and whose they are (N,).
+        """Return points of the body (N, 3) m, of the image (N, 2) pixels, and whose they are (N,).
 
         The last is the marker's row in the body, or -1 of a ChArUco board's chessboard corner.
         Where those are spread over the board they stand alone, since a crossing of edges is where
@@ -68,19 +68,11 @@ class Detection:
 
 
 def _is_spread(points: NDArray[np.float64]) -> bool:
-    """Whether points of a plane are enough for a pose, and not nearly in a line."""
+    """Tell if points of a plane are enough for a pose, and not nearly in a line."""
     if len(points) < 4:
         return False
     extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(extents[1] > _SPREAD * extents[0])
-
-
-def detect_corners(
-    image: NDArray[np.uint8], body: RigidBody
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points of the body (N, 3) m and where they are in the image (N, 2) pixels; N may be 0."""
-    points, pixels, _ = FiducialDetector(body).detect(image).correspondences(body)
-    return points, pixels
 
 
 class FiducialDetector:
@@ -102,7 +94,7 @@ class FiducialDetector:
         window: tuple[int, int, int, int] | None = None,
         reduction: int = 1,
     ) -> Detection:
-        """The body's markers in an image (rows, columns).
+        """Find the body's markers in an image (rows, columns).
 
         Args:
             image: grey.
@@ -121,20 +113,16 @@ class FiducialDetector:
             part = part[: size[1] * reduction, : size[0] * reduction]
             part = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         corners, ids, _ = self._detector.detectMarkers(part)
-        if ids is None or not len(ids):
+        if ids is None:
             return Detection(np.empty(0, np.int64), np.empty((0, 4, 2)))
         numbers = np.asarray(ids, dtype=np.int64).ravel()
         places = np.asarray(corners, dtype=np.float32).reshape(-1, 4, 2)
         places = (places + 0.5) * reduction + np.array([left - 0.5, top - 0.5])
         places = places.astype(np.float32)
         wanted = np.isin(numbers, self.body.ids)
-        numbers, places = numbers[wanted], places[wanted]
-        unique, counts = np.unique(numbers, return_counts=True)
-        doubled = unique[counts > 1]
-        single = ~np.isin(numbers, doubled)
-        numbers, places = numbers[single], places[single]
-        order = np.argsort(numbers)
-        numbers, places = numbers[order], places[order]
+        numbers, first, counts = np.unique(numbers[wanted], return_index=True, return_counts=True)
+        doubled, numbers = numbers[counts > 1], numbers[counts == 1]
+        places = places[wanted][first[counts == 1]]
         crossings = self._crossings(image, numbers, places)
         refined = [
             _refine(image, each, pattern(self.body.dictionary, number))
@@ -148,9 +136,13 @@ class FiducialDetector:
     def _crossings(
         self, image: NDArray[np.uint8], numbers: NDArray[np.int64], places: NDArray[np.float32]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Which chessboard corners (k,) are seen, and where (k, 2) pixels, between the markers."""
+        """Find which chessboard corners (k,) are clear, and where (k, 2) pixels.
+
+        Each is fitted between its neighbours.
+        """
         none = np.empty(0, np.int64), np.empty((0, 2))
-        if self._chessboard_detector is None or not len(numbers):
+        board = self.body.chessboard
+        if self._chessboard_detector is None or board is None or not len(numbers):
             return none
         corners, ids, *_ = self._chessboard_detector.detectBoard(
             image, markerCorners=list(places[:, None]), markerIds=numbers.astype(np.int32)[:, None]
@@ -159,19 +151,6 @@ class FiducialDetector:
             return none
         seen = np.asarray(ids, dtype=np.int64).ravel()
         pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-        return self._refined_crossings(image, numbers, places, seen, pixels)
-
-    def _refined_crossings(
-        self,
-        image: NDArray[np.uint8],
-        numbers: NDArray[np.int64],
-        places: NDArray[np.float32],
-        seen: NDArray[np.int64],
-        pixels: NDArray[np.float64],
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """The chessboard corners that are clear, each fitted between its neighbours."""
-        board = self.body.chessboard
-        assert board is not None
         rows = [self.body.rows[int(number)] for number in numbers]
         plane = np.concatenate(
             [self.body.corners[rows, :, :2].reshape(-1, 2), board.corners[seen, :2]]
@@ -179,7 +158,7 @@ class FiducialDetector:
         image_points = np.concatenate([places.reshape(-1, 2).astype(np.float64), pixels])
         homography, _ = cv2.findHomography(plane, image_points, cv2.LMEDS)
         if homography is None:
-            return np.empty(0, np.int64), np.empty((0, 2))
+            return none
         view: NDArray[np.float64] = np.array(homography, dtype=np.float64)
         gap = 0.5 * (board.square - board.size) / board.square
         kept, refined = [], []
@@ -204,7 +183,7 @@ class FiducialDetector:
 def _refine(
     image: NDArray[np.uint8], corners: NDArray[np.float32], cells: NDArray[np.uint8]
 ) -> NDArray[np.float64] | None:
-    """Corners (4, 2) of one marker where its edges really meet; None where those are not seen.
+    """Refine a marker's corners (4, 2) to where its edges meet; None where those are not seen.
 
     Where a small marker's edges tell nothing, its whole pattern does.
     """

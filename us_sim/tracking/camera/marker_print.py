@@ -42,7 +42,6 @@ class Sheet:
     """The print on one sheet of paper; mm from its upper left corner, x right, y down."""
 
     paper: str
-    ids: tuple[int, ...]
     marked: NDArray[np.float64]  # (n, 4, 2), corners of each marker, as the body orders them
     black: NDArray[np.float64]  # (b, 4, 2), cells
     labels: list[tuple[float, float, str]]  # where, and what is written there
@@ -87,10 +86,8 @@ def sheets(body: RigidBody, paper: str = "A4") -> list[Sheet]:
             if len(pieces) > 1:
                 x, y = place.tolist()
                 labels.append((x, y + float(size[1]) + 0.7 * _GAP, str(body.ids[first + k])))
-        ids = body.ids[first : first + across * down] if len(pieces) > 1 else body.ids
-        there = tuple(ids.tolist())
         whole = np.concatenate(marked), np.concatenate(black)
-        pages.append(Sheet(paper, there, *whole, labels, _describe(body)))
+        pages.append(Sheet(paper, *whole, labels, _describe(body)))
     return pages
 
 
@@ -122,7 +119,7 @@ def print_markers(body: RigidBody, out: Path, paper: str = "A4") -> list[Sheet]:
 
 
 def _is_flat(body: RigidBody) -> bool:
-    """Whether all markers are in one plane and face the same way."""
+    """Tell if all markers are in one plane and face the same way."""
     offsets = (body.corners - body.corners[0, 0]) @ body.normals[0]
     return bool(np.abs(offsets).max() <= _FLAT and (body.normals @ body.normals[0]).min() >= 0.999)
 
@@ -130,7 +127,7 @@ def _is_flat(body: RigidBody) -> bool:
 def _piece(
     body: RigidBody,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Corners (M, 4, 2) of a flat body's markers, black cells (b, 4, 2), and the size (2,), in mm.
+    """Lay out a flat body: its markers' corners (M, 4, 2), black cells (b, 4, 2), size (2,), mm.
 
     From its upper left corner, x right and y down as one sees it, with the white about it.
     """
@@ -167,7 +164,7 @@ def _describe(body: RigidBody) -> str:
 
 
 def _figure(sheet: Sheet) -> Figure:
-    """The sheet as matplotlib draws it, in its true size."""
+    """Draw the sheet in its true size."""
     width, height = PAPERS[sheet.paper]
     figure = Figure(figsize=(width / 25.4, height / 25.4))
     FigureCanvasAgg(figure)

@@ -22,7 +22,7 @@ import yaml
 from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
-from us_sim.settings.text_files import YamlError, load_yaml
+from us_sim.settings.text_files import read_yaml
 
 _OPENCVS = (4, 5, 8, 12, 14)  # k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]]
 DISTORTION_MODELS = {
@@ -99,7 +99,7 @@ class CameraModel:
         object.__setattr__(self, "distortion", distortion)
 
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pixels (N, 2) of points (N, 3) m; NaN for points that are not before the camera."""
+        """Project points (N, 3) m to pixels (N, 2); NaN for those not before the camera."""
         return self.linearise(points, _STILL)[0]
 
     def linearise(
@@ -153,7 +153,7 @@ class CameraModel:
         return self.distortion_model == "equidistant"
 
     def require_image(self, image: NDArray[Any]) -> NDArray[np.uint8]:
-        """The image, which is one of this camera.
+        """Return the image if it is one of this camera.
 
         Raises:
             TrackingError: it is not grey, or not of the camera's size.
@@ -182,20 +182,12 @@ def _numbers(values: Any, what: str) -> NDArray[np.float64]:
 
 
 def read_camera_info(path: Path | str) -> CameraModel:
-    """The camera of a YAML file as ``camera_calibration`` and ``camera_info_manager`` write it.
+    """Read the camera of a YAML file as ``camera_calibration`` or ``camera_info_manager`` write it.
 
     Raises:
         TrackingError: the file, or what it says, is not a camera's.
     """
-    path = Path(path)
-    try:
-        content = load_yaml(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise TrackingError(f"{path}: {error.strerror or error}") from error
-    except (UnicodeDecodeError, YamlError) as error:
-        raise TrackingError(
-            f"{path}: not a YAML file of camera info: {str(error).splitlines()[0]}"
-        ) from error
+    content = read_yaml(Path(path), TrackingError)
     if not isinstance(content, Mapping):
         raise TrackingError(f"{path}: not camera info; it must be a mapping")
     wanted = ("image_width", "image_height", "camera_matrix", "distortion_coefficients")
@@ -207,13 +199,8 @@ def read_camera_info(path: Path | str) -> CameraModel:
     if not all(isinstance(size, int) and not isinstance(size, bool) for size in sizes):
         raise TrackingError(f"{path}: image_width and image_height must be whole, not {sizes}")
     try:
-        return CameraModel(
-            sizes[0],
-            sizes[1],
-            _data(content, "camera_matrix"),
-            _data(content, "distortion_coefficients"),
-            model,
-        )
+        matrix, distortion = (_data(content, key) for key in wanted[2:])
+        return CameraModel(*sizes, matrix, distortion, model)
     except TrackingError as error:
         raise TrackingError(f"{path}: {error}") from error
 
@@ -231,7 +218,6 @@ def write_camera_info(
     Raises:
         TrackingError: the file exists.
     """
-    path = Path(path)
     projection = np.hstack([camera.matrix, np.zeros((3, 1))])
     content: dict[str, Any] = {
         "image_width": camera.width,
@@ -245,7 +231,7 @@ def write_camera_info(
         **(notes or {}),
     }
     try:
-        with path.open("x", encoding="utf-8") as file:
+        with open(path, "x", encoding="utf-8") as file:
             yaml.safe_dump(content, file, sort_keys=False, default_flow_style=None, width=100)
     except FileExistsError:
         raise TrackingError(f"{path}: exists already; choose another name") from None

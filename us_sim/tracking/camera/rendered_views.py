@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Pose, product
 from us_sim.geometry.se3 import rotation_exp
 from us_sim.kernels import njit
 from us_sim.tracking.camera.model import CameraModel
@@ -206,8 +206,8 @@ class RenderedView:
 
 def _moved(pose: Pose, motion: NDArray[np.float64]) -> Pose:
     """Shifted and turned about its own origin, both along the camera's axes."""
-    turned = Pose(np.zeros(3), rotation_exp(motion[3:])) @ Pose(np.zeros(3), pose.orientation)
-    return Pose(pose.position + motion[:3], turned.orientation)
+    turned = product(rotation_exp(motion[3:]), pose.orientation)
+    return Pose(pose.position + motion[:3], turned)
 
 
 _BLANK = np.ones((1, 1), dtype=np.bool_)

@@ -21,13 +21,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import PoseError, TrackingError
-from us_sim.geometry.pose import PLACE, Pose
+from us_sim.errors import TrackingError
+from us_sim.geometry.pose import Placement
 from us_sim.settings.choice import Choice, Chosen
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
-from us_sim.settings.text_files import YamlError, load_yaml
+from us_sim.settings.text_files import read_yaml
 from us_sim.tracking.camera.markers import dictionary, marker_count, proper_name, square
 from us_sim.tracking.settings import MARKER_SIZE
 
@@ -110,12 +110,11 @@ class RigidBody:
     chessboard: Chessboard | None = None
 
     def __post_init__(self) -> None:
-        ids = np.array(self.ids)
+        ids = np.array(self.ids, dtype=np.int64)
         corners = np.array(self.corners, dtype=np.float64)
         object.__setattr__(self, "dictionary", proper_name(self.dictionary))
         for number in ids.tolist():
             _require_in_dictionary(self.dictionary, number)
-        ids = ids.astype(np.int64)
         numbers, counts = np.unique(ids, return_counts=True)
         if counts.max() > 1:
             raise TrackingError(f"marker {numbers[counts.argmax()]} is in the body twice")
@@ -201,14 +200,9 @@ class RigidBody:
     @cached_property
     def normals(self) -> NDArray[np.float64]:
         """(M, 3): unit normal of each marker, towards who sees its front."""
-        return _normals(self.corners)
-
-
-def _normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    normals = np.cross(
-        corners[..., 1, :] - corners[..., 3, :], corners[..., 0, :] - corners[..., 2, :]
-    )
-    return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+        a, b, c, d = self.corners.transpose(1, 0, 2)
+        normals = np.cross(b - d, a - c)
+        return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
 def _require_in_dictionary(name: str, number: int) -> None:
@@ -221,29 +215,14 @@ _NUMBER = Quantity("number", 0, 65535)
 _COUNT, _SQUARES = Quantity("number", 1, 100), Quantity("number", 2, 100)
 
 
-@dataclass(frozen=True)
-class _Marker(Settings):
-    """A marker of a body: its size and where it is."""
+@dataclass(frozen=True, kw_only=True)
+class _Marker(Placement):
+    """A marker of a body: its size, and where its middle is in the body."""
 
     error = TrackingError
 
     id: int = setting(_NUMBER, "number in the dictionary")
     size: float = setting(MARKER_SIZE, "edge of its black square")
-    position: tuple[float, float, float] = setting(
-        PLACE, "of its middle in the body", default=(0.0, 0.0, 0.0)
-    )
-    orientation: tuple[float, float, float, float] = setting(
-        Quantity("number", -1e6, 1e6), "quaternion x, y, z, w", default=(0.0, 0.0, 0.0, 1.0)
-    )
-
-    @property
-    def points(self) -> NDArray[np.float64]:
-        """(4, 3) m, the corners in the body."""
-        try:
-            pose = Pose(np.array(self.position), np.array(self.orientation))
-        except PoseError as error:
-            raise self.refused("orientation", str(error)) from error
-        return pose.apply(square(self.size))
 
 
 @dataclass(frozen=True)
@@ -317,12 +296,7 @@ def read_rigid_body(path: Path | str) -> RigidBody:
     Raises:
         TrackingError: the file, or the body in it, cannot be used.
     """
-    try:
-        content = load_yaml(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise TrackingError(f"{path}: {error.strerror or error}") from error
-    except (UnicodeDecodeError, YamlError) as error:
-        raise TrackingError(f"{path}: not a YAML file: {error}") from error
+    content = read_yaml(Path(path), TrackingError)
     if not isinstance(content, Mapping):
         raise TrackingError(f"{path}: it must be a mapping with dictionary and markers or board")
     written = Reader(str(path), error=TrackingError).read(_Body, content)
@@ -330,7 +304,7 @@ def read_rigid_body(path: Path | str) -> RigidBody:
         if written.board is not None:
             board: GridBoard | CharucoBoard = written.board.settings(_BOARDS)
             return board.body(written.dictionary)
-        corners = np.array([marker.points for marker in written.markers])
+        corners = np.array([each.pose.apply(square(each.size)) for each in written.markers])
         numbers = np.array([marker.id for marker in written.markers])
         return RigidBody(written.dictionary, numbers, corners)
     except TrackingError as error:

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 import os
-import stat
 import time
 from pathlib import Path
 
@@ -88,8 +87,11 @@ class CameraSource:
         self.seen = 0
         before = self._before(stamp)
         detection = self._detect(image, before)
-        if detection.doubled:
-            self.last_problem = _copies(detection.doubled)
+        if copied := detection.doubled:
+            self.last_problem = (
+                f"the image has two copies of {'marker' if len(copied) == 1 else 'markers'} "
+                f"{', '.join(map(str, copied))}: none is used; show only one"
+            )
         measured = self._pose(image, detection, before)
         if measured is None:
             return None
@@ -251,12 +253,6 @@ class CameraSource:
         return [] if ids is None else np.unique(np.asarray(ids, dtype=np.int64)).tolist()
 
 
-def _copies(numbers: tuple[int, ...]) -> str:
-    listed = ", ".join(str(number) for number in numbers)
-    plural = "marker" if len(numbers) == 1 else "markers"
-    return f"the image has two copies of {plural} {listed}: none is used; show only one"
-
-
 _PATIENCE_MS = 5000  # with a stream that is not there or sends nothing
 _USUAL_RATE = 30.0  # Hz, of a file that does not say
 _ERRORS_ONLY = 2  # of OpenCV's levels
@@ -281,24 +277,15 @@ class VideoSource:
         self.name = source.strip()
         self._size, self._rate = size, rate
         self._capture: cv2.VideoCapture | None = None
-        path = Path(os.path.expanduser(self.name))
-        is_live = self.name.isdigit() or "://" in self.name
-        if not is_live and not os.path.exists(path):
-            if self.name.startswith("/dev/"):
-                is_live = True  # it may be plugged in later
-            else:
-                raise TrackingError(
-                    f"{source}: there is no such file; give a video, a camera's number or a "
-                    f"stream's address"
-                )
-        mode = 0 if is_live else os.stat(path).st_mode
-        if not (is_live or stat.S_ISREG(mode) or stat.S_ISCHR(mode)):
+        self._target = os.path.expanduser(self.name)
+        may_come = self.name.startswith("/dev/") and not os.path.exists(self._target)
+        is_live = self.name.isdigit() or "://" in self.name or may_come
+        self.is_file = not is_live and os.path.isfile(self._target)
+        if not (is_live or self.is_file or Path(self._target).is_char_device()):
             raise TrackingError(
-                f"{source}: it is neither a file nor a device; give a video, a camera's number or "
-                f"a stream's address"
+                f"{source}: there is no such file or device; give a video, a camera's number or a "
+                f"stream's address"
             )
-        self.is_file = stat.S_ISREG(mode)
-        self._target = str(path) if not is_live else self.name
 
     def open(self) -> bool:
         """Begin, or begin again, with the first image; whether there is something to begin with."""

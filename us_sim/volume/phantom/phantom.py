@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from us_sim.cache import Form, cache_folder, kept
+from us_sim.cache import cache_folder, kept
 from us_sim.errors import VolumeError
 from us_sim.settings.registry import PHANTOMS
 from us_sim.volume.settings import SEED, VOXEL_SIZE
@@ -145,7 +145,7 @@ def kept_volume(key: str, make: Callable[[], Volume]) -> Volume:
         key: a file name that contains everything on which the volume's bytes depend.
         make: makes the volume; called by one process at a time.
     """
-    return kept(key, Form("volume.json", _pack, _unpack), make)
+    return kept(key, _pack, _unpack, make)
 
 
 def _key(name: str, seed: int, voxel_size: float) -> str:
