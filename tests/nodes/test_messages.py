@@ -17,14 +17,15 @@ from visualization_msgs.msg import Marker, MarkerArray
 from us_sim.errors import MeshError, MessageError, PoseError, ProbeError, StampError, VolumeError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.messages import (
+    Shape,
     affine_message,
     cloud_message,
     image_message,
     mesh_message,
     pose_message,
     pose_text,
+    serialize_markers,
     stamp_message,
-    surface_markers,
 )
 from us_sim.recording.decoding import (
     affine_from,
@@ -195,14 +196,14 @@ def test_structure_markers_are_what_rclpy_would_serialize(surfaces, frame):
         random = np.random.default_rng(seed)
         triangles = random.integers(0, len(vertices), (count, 3))
         colour = (0.25, 0.5, 0.75, 1.0)
-        given_ones.append((name, colour, vertices, triangles))
+        given_ones.append(Shape(name, colour, vertices[triangles.ravel()]))
         marker = Marker(ns=name, type=Marker.TRIANGLE_LIST, action=Marker.ADD)
         marker.header.stamp, marker.header.frame_id = STAMP, frame
         marker.scale.x = marker.scale.y = marker.scale.z = marker.pose.orientation.w = 1.0
         marker.color.r, marker.color.g, marker.color.b, marker.color.a = colour
         marker.points = [Point(x=x, y=y, z=z) for x, y, z in vertices[triangles.ravel()].tolist()]
         expected.markers.append(marker)
-    serialized = surface_markers(given_ones, STAMP, frame)
+    serialized = serialize_markers(given_ones, STAMP, frame)
     # Not byte for byte: what fills the gaps between numbers is up to the middleware.
     assert len(serialized) == len(serialize_message(expected))
     assert deserialize_message(serialized, MarkerArray) == expected

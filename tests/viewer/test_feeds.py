@@ -21,11 +21,12 @@ from us_sim.geometry.collider import RoundedBox
 from us_sim.geometry.transducer import transducer_mesh
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import (
+    Shape,
     affine_message,
     cloud_message,
     image_message,
     mesh_message,
-    surface_markers,
+    serialize_markers,
     tetrahedra_message,
     wrench_message,
 )
@@ -339,10 +340,11 @@ def test_structures_are_heard_once_and_carried_from_then_on(graph):
     markers = graph.bench.publisher(MarkerArray, "tissue/structures")
     nodes = graph.bench.publisher(PointCloud2, "tissue/nodes")
     deformed = MESH.nodes + np.array([0, 0, 0.002])
-    vein = ("vein", (0.2, 0.4, 0.8, 1.0), SMALL + np.array([0, 0, 0.002]), CLOSED)
+    corners = (SMALL + np.array([0, 0, 0.002]))[CLOSED.ravel()]
+    vein = Shape("vein", (0.2, 0.4, 0.8, 1.0), corners)
     nodes.publish(cloud(deformed, second=4))
     nodes.publish(cloud(deformed, second=5))
-    markers.publish(surface_markers([vein], Time(sec=5), "patient"))
+    markers.publish(serialize_markers([vein], Time(sec=5), "patient"))
     packet = graph.newest("structures")
     count = packet.header["vertices"]
     nodes_of = np.frombuffer(packet.payload, np.uint32, 4 * count).reshape(-1, 4)
@@ -356,9 +358,10 @@ def test_structures_are_heard_once_and_carried_from_then_on(graph):
 
 def test_the_probe_comes_with_its_shape_its_pose_and_its_force(graph):
     parts = transducer_mesh(RoundedBox(length=0.046, width=0.014, height=0.04, rounding=0.004))
-    surfaces = [(part.name, (*part.colour, 1.0), part.vertices, part.triangles) for part in parts]
+    shapes = [Shape(p.name, (*p.colour, 1.0), p.vertices[p.triangles.ravel()]) for p in parts]
     outline = np.array([[-0.02, 0, 0], [0.02, 0, 0], [0.02, 0, 0.04], [-0.02, 0, 0.04]])
-    graph.latch(MarkerArray, "probe/marker", surface_markers(surfaces, Time(), "probe", outline))
+    shapes.append(Shape("image", (1.0,) * 4, np.concatenate([outline, outline[:1]]), 4e-4))
+    graph.latch(MarkerArray, "probe/marker", serialize_markers(shapes, Time(), "probe"))
     for kind in ("probe_mesh", "probe"):
         graph.feeds[kind].watch(unused)
     told = graph.newest("probe_mesh")

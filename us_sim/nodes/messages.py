@@ -20,11 +20,7 @@ from shape_msgs.msg import Mesh, MeshTriangle
 from std_msgs.msg import Float64MultiArray, Header, Int32MultiArray, MultiArrayDimension
 from visualization_msgs.msg import Marker
 
-from us_sim.errors import (
-    PoseError,
-    StampError,
-    TrackingError,
-)
+from us_sim.errors import PoseError, StampError, TrackingError
 from us_sim.geometry.pose import Pose
 from us_sim.recording.decoding import LAST_SECOND, SECOND, nanoseconds_since
 from us_sim.tracking.haptic import ContactModel
@@ -204,10 +200,15 @@ def affine_message(matrix: NDArray[np.floating]) -> Float64MultiArray:
     return message
 
 
-Surface = tuple[str, tuple[float, float, float, float], NDArray[np.floating], NDArray[np.integer]]
-"""A marker's namespace, its red, green, blue and alpha, (V, 3) m vertices and (T, 3) triangles."""
-_LINE_WIDTH = 4e-4  # m, of an image's outline
-_OUTLINE_COLOUR = (0.31, 0.70, 0.75, 1.0)
+class Shape(NamedTuple):
+    """Triangles or a line, as a marker shows them."""
+
+    namespace: str
+    colour: tuple[float, float, float, float]  # red, green, blue, alpha
+    points: NDArray[np.floating]  # (P, 3) m, three of each triangle in a row
+    line_width: float = 0.0  # m; 0: it is triangles
+
+
 _EMPTY = (1, b"\0")  # a string
 _MARKER_TAIL = struct.pack(
     "@II1siII1sI1sIII1sI1sI1sI?",
@@ -216,61 +217,33 @@ _MARKER_TAIL = struct.pack(
 """Fields of a Marker after its points: colors, textures, text and meshes, all empty."""
 
 
-def surface_marker(surface: Surface, stamp: Time, frame: str) -> bytes:
-    """A TRIANGLE_LIST marker of one surface, serialized."""
-    return b"".join([CDR_LITTLE_ENDIAN, *_serialized(_triangles(surface), stamp, frame, 0)])
+def serialize_marker(shape: Shape, stamp: Time, frame: str) -> bytes:
+    """Make the serialized Marker of a shape."""
+    return b"".join([CDR_LITTLE_ENDIAN, *_serialized(shape, stamp, frame, 0)])
 
 
-def surface_markers(
-    surfaces: Sequence[Surface],
-    stamp: Time,
-    frame: str,
-    outline: NDArray[np.floating] | None = None,
-) -> bytes:
-    """A MarkerArray with a TRIANGLE_LIST of each surface in its own namespace, serialized.
-
-    With an outline (P, 3) m of an image, a closed LINE_STRIP ``image`` is the last.
-    """
-    shapes = list(map(_triangles, surfaces))
-    if outline is not None:
-        closed = np.concatenate([outline, outline[:1]]).astype(np.float64)
-        width = (_LINE_WIDTH, 0.0, 0.0)
-        shapes.append(_Shape("image", Marker.LINE_STRIP, width, _OUTLINE_COLOUR, closed))
+def serialize_markers(shapes: Sequence[Shape], stamp: Time, frame: str) -> bytes:
+    """Make the serialized MarkerArray of shapes, each in its own namespace."""
     parts = [CDR_LITTLE_ENDIAN, struct.pack("@I", len(shapes))]
     for shape in shapes:
         parts += _serialized(shape, stamp, frame, sum(map(len, parts[1:])))
     return b"".join(parts)
 
 
-class _Shape(NamedTuple):
-    """What differs between the markers that are sent."""
-
-    namespace: str
-    kind: int  # of a Marker
-    scale: tuple[float, float, float]
-    colour: tuple[float, float, float, float]  # red, green, blue, alpha
-    points: NDArray[np.float64]  # (P, 3), m
-
-
-def _triangles(surface: Surface) -> _Shape:
-    namespace, colour, vertices, triangles = surface
-    corners = vertices.astype(np.float64)[triangles.ravel()]
-    return _Shape(namespace, Marker.TRIANGLE_LIST, (1.0, 1.0, 1.0), colour, corners)
-
-
-def _serialized(shape: _Shape, stamp: Time, frame: str, offset: int) -> list[bytes]:
-    """The parts of a serialized marker that begins at that offset of a message.
+def _serialized(shape: Shape, stamp: Time, frame: str, offset: int) -> list[bytes]:
+    """Make the parts of a serialized marker that begins at that offset of a message.
 
     It holds an object for each point, too slow to make one by one. So the CDR is written here:
     native alignment in `struct` is CDR's, and ``0d`` aligns what follows.
     """
     name, place = shape.namespace.encode() + b"\0", frame.encode() + b"\0"
+    kind = Marker.LINE_STRIP if shape.line_width else Marker.TRIANGLE_LIST
+    scale = (shape.line_width, 0.0, 0.0) if shape.line_width else (1.0, 1.0, 1.0)
     identity = (0, 0, 0, 0, 0, 0, 1)
     before, count = offset % 8, len(shape.points)
     head = struct.pack(
         f"@{before}xiII{len(place)}sI{len(name)}siii10d4fiI?I" + ("0d" if count else ""),
         *(stamp.sec, stamp.nanosec, len(place), place, len(name), name),
-        *(0, shape.kind, Marker.ADD, *identity, *shape.scale, *shape.colour),
-        *(0, 0, False, count),
+        *(0, kind, Marker.ADD, *identity, *scale, *shape.colour, 0, 0, False, count),
     )
-    return [head[before:], shape.points.tobytes(), _MARKER_TAIL]
+    return [head[before:], shape.points.astype(np.float64, copy=False).tobytes(), _MARKER_TAIL]

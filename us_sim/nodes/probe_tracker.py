@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
@@ -11,10 +12,11 @@ from visualization_msgs.msg import MarkerArray
 
 from us_sim.geometry.transducer import transducer_mesh
 from us_sim.nodes.messages import (
+    Shape,
     pose_message,
     pose_text,
+    serialize_markers,
     stamp_message,
-    surface_markers,
     transform_message,
 )
 from us_sim.nodes.parameters import LiveSettings
@@ -37,6 +39,7 @@ from us_sim.tracking.measurement import PATIENT, Measurement, TrackingState
 
 OWN = "probe_tracker"
 FARTHEST = 100.0  # m from the device's origin, beyond which a pose is in another unit, or nonsense
+OUTLINE, LINE_WIDTH = (0.31, 0.70, 0.75, 1.0), 4e-4  # colour and m, of the image in the marker
 CHECKS = 20.0  # times a second that the state is looked at when nothing comes
 LEVELS = {
     TrackingState.WAITING: DiagnosticStatus.STALE,
@@ -94,12 +97,13 @@ class ProbeTracker(Device):
             self.latched(TFMessage, "tf_static").publish(TFMessage(transforms=[placed]))
 
     def _transducer(self) -> bytes:
-        """The scene's transducer and the outline of its image; without a collider the latter."""
+        """Make markers of the scene's transducer, where it has a collider, and its image."""
         section = self.scene.probe.collider
         parts = transducer_mesh(collider_of(self.scene)) if section is not None else []
-        surfaces = [(p.name, (*p.colour, 1.0), p.vertices, p.triangles) for p in parts]
+        shapes = [Shape(p.name, (*p.colour, 1.0), p.vertices[p.triangles.ravel()]) for p in parts]
         outline = image_outline(probe_of(self.scene))
-        return surface_markers(surfaces, TimeMessage(), "probe", outline)
+        shapes.append(Shape("image", OUTLINE, np.concatenate([outline, outline[:1]]), LINE_WIDTH))
+        return serialize_markers(shapes, TimeMessage(), "probe")
 
     def _use(self, values: dict[str, Any]) -> None:
         self._tracking.filter = _filter(values)

@@ -9,7 +9,7 @@ from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
 from visualization_msgs.msg import Marker
 
-from us_sim.nodes.messages import cloud_message, mesh_message, surface_marker
+from us_sim.nodes.messages import Shape, cloud_message, mesh_message, serialize_marker
 from us_sim.nodes.parameters import LiveSettings
 from us_sim.nodes.process import node_main
 from us_sim.nodes.scene_node import SceneNode
@@ -76,8 +76,8 @@ class SkinDeformer(SceneNode):
             self.health.published("skin/nodes", stamp)
         if shown:
             colour = (*_COLOUR, self._settings.values["markers"].marker_opacity)
-            surface = ("skin", colour, skin.vertices, self._triangles)
-            self._marker.publish(surface_marker(surface, stamp, "patient"))
+            shape = Shape("skin", colour, skin.vertices[self._triangles.ravel()])
+            self._marker.publish(serialize_marker(shape, stamp, "patient"))
             self.health.published("skin/marker")
         self.health.state = "running"
         self.health.values = {"residual": f"{skin.residual:.3g}", "action": skin.action}

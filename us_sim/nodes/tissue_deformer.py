@@ -19,9 +19,10 @@ from visualization_msgs.msg import MarkerArray
 from us_sim.errors import SceneError, SolverError, TrackingError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.messages import (
+    Shape,
     cloud_message,
     contact_model_message,
-    surface_markers,
+    serialize_markers,
     tetrahedra_message,
     wrench_message,
 )
@@ -90,11 +91,11 @@ class StructureMarkers:
     def publish(self, nodes: NDArray[np.float64], stamp: TimeMessage) -> None:
         """Send the structures as they are when the tissue's nodes (N, 3) are there, m."""
         self._sent = nanoseconds_of(stamp)
-        surfaces = [
-            (made.name, (*made.colour, 1.0), made.surface.carry(nodes), made.surface.triangles)
-            for made in self._structures
-        ]
-        self._publisher.publish(surface_markers(surfaces, stamp, "patient"))
+        shapes = []
+        for made in self._structures:
+            corners = made.surface.carry(nodes)[made.surface.triangles.ravel()]
+            shapes.append(Shape(made.name, (*made.colour, 1.0), corners))
+        self._publisher.publish(serialize_markers(shapes, stamp, "patient"))
         self._node.health.published(STRUCTURES)
 
     def _make(self) -> None:
