@@ -171,7 +171,7 @@ def listening() -> Iterator[Arrivals]:
     from rclpy.signals import SignalHandlerOptions
 
     from us_sim.evaluation.latency.arrivals import Arrivals
-    from us_sim.nodes.process import go_along, go_first
+    from us_sim.nodes.process import go_first
 
     context = Context()
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
@@ -189,6 +189,6 @@ def listening() -> Iterator[Arrivals]:
     try:
         yield node
     finally:
-        go_along()
+        os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
         context.try_shutdown()
         thread.join(timeout=5.0)

@@ -39,14 +39,8 @@ def go_first(priority: int = COMPUTING) -> str:
         How they run from now on: ``realtime``, or ``ordinary`` where that is not allowed.
     """
     tried = range(priority, 0, -1) if hasattr(os, "sched_setscheduler") else ()
-    able = any(_schedule(os.SCHED_RR, each) for each in tried)
+    able = any(_schedule(each) for each in tried)
     return "realtime" if able else "ordinary"
-
-
-def go_along() -> None:
-    """Let all present threads of this process run as ordinary programs again."""
-    if hasattr(os, "sched_setscheduler"):
-        _schedule(os.SCHED_OTHER, 0)
 
 
 def let_receivers_go_first() -> None:
@@ -56,11 +50,11 @@ def let_receivers_go_first() -> None:
     messages that they keep for whoever does not.
     """
     if hasattr(os, "sched_setscheduler"):
-        _schedule(os.SCHED_RR, MEASURING, {thread.native_id for thread in threading.enumerate()})
+        _schedule(MEASURING, {thread.native_id for thread in threading.enumerate()})
 
 
-def _schedule(policy: int, priority: int, but: Collection[int | None] = ()) -> bool:
-    policy |= getattr(os, "SCHED_RESET_ON_FORK", 0)
+def _schedule(priority: int, but: Collection[int | None] = ()) -> bool:
+    policy = os.SCHED_RR | getattr(os, "SCHED_RESET_ON_FORK", 0)
     try:
         for thread in os.listdir("/proc/self/task"):
             if int(thread) in but:
@@ -70,18 +64,6 @@ def _schedule(policy: int, priority: int, but: Collection[int | None] = ()) -> b
     except OSError:
         return False
     return True
-
-
-def scheduling_of(pid: int) -> str:
-    """How the main thread of a process runs, in the words of `go_first`."""
-    if not hasattr(os, "sched_getscheduler"):
-        return "ordinary"
-    try:
-        policy = os.sched_getscheduler(pid)
-    except OSError:  # it has ended
-        return "ordinary"
-    policy &= ~getattr(os, "SCHED_RESET_ON_FORK", 0)
-    return "realtime" if policy == os.SCHED_RR else "ordinary"
 
 
 TURN_S = 0.1

@@ -75,7 +75,6 @@ def run_case(case: Case) -> list[dict[str, Any]]:
         UsSimError: the simulation ends, or no image comes.
     """
     from us_sim.evaluation.latency.arrivals import stamp_of
-    from us_sim.nodes.process import scheduling_of
 
     with tempfile.TemporaryDirectory(prefix="us_sim_latency_") as name:
         scene, session = Path(name) / "scene.yaml", Path(name) / "session.mcap"
@@ -92,7 +91,8 @@ def run_case(case: Case) -> list[dict[str, Any]]:
             simulation.await_images(arrivals)
             time.sleep(2.0)  # these images do not count
             pids = {node: pid for pid, node in started_by(simulation.process.pid).items()}
-            scheduling = scheduling_of(pids["tissue_deformer"])
+            policy = os.sched_getscheduler(pids["tissue_deformer"]) & ~os.SCHED_RESET_ON_FORK
+            scheduling = "realtime" if policy == os.SCHED_RR else "ordinary"
             usage = UsageOverTime(simulation.process.pid)
             began, began_ns = time.monotonic(), time.time_ns()
             while time.monotonic() - began < case.seconds:
