@@ -24,12 +24,14 @@ def session(tmp_path):
         bag.add_topic("/note", STRING, [DEFAULT_QOS._replace(depth=3)])
         bag.attach("scene.yaml", "application/yaml", b"name: arm\n", EPOCH)
         bag.attach("camera.yaml", "application/yaml", b"width: 640\n", EPOCH)
+        bag.add_topic("/session/marker", STRING, [])
         for k in range(20):
             bag.write("/note", text(f"{k}"), EPOCH + k * 10**8)
             if k == 10:
                 bag.flush()
+            if k == 5:
+                bag.write("/session/marker", text("needle in"), EPOCH + 5 * 10**8)
             if k == 15:
-                bag.note("marker", {"time": str(EPOCH + 15 * 10**8), "text": "needle in"})
                 bag.note("messages_lost", {"/note": "2"})
                 bag.note("messages_lost", {"/note": "1"})
     return file
@@ -45,17 +47,17 @@ def test_a_killed_recording_lacks_less_than_a_second_and_is_repaired(tmp_path, a
 def test_a_cut_recording_is_made_whole(session, tmp_path):
     content = session.read_bytes()
     cut = tmp_path / "cut.mcap"
-    cut.write_bytes(content[: content.index(b"needle in") + 200])
+    cut.write_bytes(content[: content.index(b"messages_lost") + 200])
     made = repair(cut, tmp_path / "whole")
     assert len(made.faults) == 1
     assert "was not ended properly" in made.faults[0].text
     whole = read_bag(tmp_path / "whole")
     assert not whole.note
     assert list(whole.messages()) == list(read_bag(cut).messages())
-    assert made.message_count == whole.message_count == 11  # in whole chunks
+    assert made.message_count == whole.message_count == 12  # in whole chunks
     assert whole.topic("/note").qos == (DEFAULT_QOS._replace(depth=3),)
     assert whole.attachments.keys() == {"scene.yaml", "camera.yaml"}
-    assert whole.markers() == [(EPOCH + 15 * 10**8, "needle in")]
+    assert whole.markers() == [(EPOCH + 5 * 10**8, "needle in")]
     assert cut.read_bytes() == content[: len(cut.read_bytes())]  # untouched
 
 
@@ -70,7 +72,7 @@ def test_a_damaged_chunk_is_left_out_and_said(session, tmp_path):
         EPOCH + k * 10**8 for k in range(11, 20)
     ]
     assert "is damaged in its chunk" in made.faults[0].text
-    assert made.faults[0].messages == 11
+    assert made.faults[0].messages == 12
 
 
 @pytest.mark.parametrize("at", [33, 60])
@@ -81,7 +83,7 @@ def test_without_an_index_a_damaged_chunk_is_left_out(session, tmp_path, at):
     content[second.chunk_start_offset + at] ^= 16
     session.write_bytes(content[: content.rindex(b"\x0f\x04")])
     made = repair(session, tmp_path / "whole")
-    assert made.message_count == 15
+    assert made.message_count == 16
     assert "is damaged in its record" in made.faults[0].text
 
 
@@ -92,7 +94,7 @@ def test_an_attached_recording_that_is_cut_is_not_taken_for_the_recording(sessio
         bag.attach("session.mcap", "application/octet-stream", session.read_bytes(), EPOCH)
     content = file.read_bytes()
     for damaged in (
-        content[: content.index(b"needle in") + 200],
+        content[: content.index(b"messages_lost") + 200],
         content.replace(b"needle", b"noodle"),
     ):
         file.write_bytes(damaged)
@@ -119,13 +121,13 @@ def test_the_files_of_a_restarted_recorder_become_one_bag(session, tmp_path):
         bag.add_topic("/note", STRING)
         bag.write("/note", text("later"), EPOCH + 10**10)
     assert bag.path == tmp_path / "session_1.mcap"
-    assert repair(tmp_path, tmp_path / "whole").message_count == 17
+    assert repair(tmp_path, tmp_path / "whole").message_count == 18
 
 
 def test_the_commands(session, tmp_path, capsys):
     assert main(["bag", "info", str(session)]) == 0
     told = capsys.readouterr().out
-    for line in ("3 of /note", "1.500 s  needle in", "scene.yaml (10 bytes)"):
+    for line in ("3 of /note", "0.500 s  needle in", "scene.yaml (10 bytes)"):
         assert f"  {line}\n" in f"{told}\n"
     assert main(["bag", "extract", str(session), "--out", str(tmp_path / "out")]) == 0
     assert (tmp_path / "out/camera.yaml").read_text() == "width: 640\n"
@@ -133,7 +135,7 @@ def test_the_commands(session, tmp_path, capsys):
     assert "exists already: choose another folder" in capsys.readouterr().err
     assert main(["bag", "repair", str(session)]) == 0
     whole = tmp_path / "session_repaired"
-    assert f"20 messages are in {whole}/session_repaired_0.mcap" in capsys.readouterr().out
+    assert f"21 messages are in {whole}/session_repaired_0.mcap" in capsys.readouterr().out
     assert main(["bag", "repair", str(session)]) != 0
     assert "exists already" in capsys.readouterr().err
 

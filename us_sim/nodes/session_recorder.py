@@ -13,10 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.serialization import deserialize_message
 from rclpy.type_support import check_for_type_support
 from rosbags.interfaces import Qos
-from std_msgs.msg import String
 
 from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode, Health
@@ -25,9 +23,9 @@ from us_sim.nodes.process import let_receivers_go_first, let_signals_wait, node_
 from us_sim.nodes.sessions.attachments import session_attachments
 from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
 from us_sim.nodes.settings import SessionRecorderSettings
-from us_sim.nodes.topics import MARKERS, TOPICS
+from us_sim.nodes.topics import TOPICS
 from us_sim.recording.schemas import normalized_type, type_hash
-from us_sim.recording.topic import MARKER, qos_of
+from us_sim.recording.topic import qos_of
 from us_sim.recording.write_behind import WriteBehind
 from us_sim.recording.writer import BagWriter
 from us_sim.settings.spelling import counted
@@ -45,8 +43,6 @@ class SessionRecorder(GuardedNode):
     Its parameters are those of `SessionRecorderSettings`, its service is ``~/stop``.
     Topics that are made on demand, such as ``ultrasound/image_annotated``, are recorded only where
     ``topics`` or ``also`` names them: they are large, and follow from others.
-
-    A text on ``session/marker`` marks a moment of the recording.
     """
 
     executor_class = SingleThreadedExecutor  # rclpy's EventsExecutor hands on no message's number
@@ -60,7 +56,6 @@ class SessionRecorder(GuardedNode):
             lambda topic: settings.records(topic, self.get_namespace())
         )
         _load_types()
-        self._marker_topic = self.resolve_topic_name(MARKERS)
         self._attachments = session_attachments(settings)
         self._refused: set[tuple[str, str]] = set()  # topics of a type, as has been said
         self._topics: dict[str, RecordedTopic] = {}
@@ -188,8 +183,6 @@ class SessionRecorder(GuardedNode):
         message = topic, data, now, sent if sent > 0 else now
         if self._bag is None:
             return
-        if topic == self._marker_topic:
-            self._mark(data, now)
         if not self._settings.paused:
             if self._bag.put(*message):
                 self.health.published(topic)
@@ -202,16 +195,6 @@ class SessionRecorder(GuardedNode):
         received: int = info.get("received_timestamp") or 0
         is_known = received > 0 and not clock.ros_time_is_active  # which is another clock's
         return received if is_known else int(clock.now().nanoseconds)
-
-    def _mark(self, data: bytes, now: int) -> None:
-        """Put a marker beside the messages, too, where it is found at once."""
-        try:
-            text = deserialize_message(data, String).data
-        except Exception as error:  # what this raises differs between versions of ROS
-            self.health.problem("marker", f"what came on {MARKERS} is no text: {error}")
-            return
-        assert self._bag is not None
-        self._bag.note(MARKER, {"time": str(now), "text": text})
 
     def _lost(self, topic: str, count: int) -> None:
         if self._bag is not None and not self._settings.paused:

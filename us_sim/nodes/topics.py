@@ -33,8 +33,6 @@ class Topic:
         return set(self.publishers) <= stand_ins
 
 
-MARKERS = "session/marker"
-"""Topic of texts that mark a moment."""
 FROZEN = "frozen"
 """The text of a page that freezes its image."""
 

@@ -122,8 +122,9 @@ class Bag:
 
     def markers(self) -> list[tuple[int, str]]:
         """Return the moments that a person marked: ns since the epoch, and the text."""
-        marked = [note.metadata for note in self.notes if note.name == MARKER]
-        return [(_count(values.get("time", "")), values.get("text", "")) for values in marked]
+        topics = [each.name for each in self.topics if each.name.endswith(f"/{MARKER}")]
+        messages = self.messages(topics, [])
+        return [(each.log_time, self.deserialize(each).data) for each in messages]
 
     def lost(self) -> Counter[str]:
         """Count the messages that the recorder says that it lost, by topic."""

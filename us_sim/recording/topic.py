@@ -84,8 +84,8 @@ def qos_from_yaml(document: Any, where: str = "offered_qos_profiles") -> tuple[Q
 
 LOST = "messages_lost"
 """The note that says how many messages of each topic are missing since the note before."""
-MARKER = "marker"
-"""The note of a moment that a person marked: its ``time`` in ns, and a ``text``."""
+MARKER = "session/marker"
+"""The topic of texts that mark a moment, in the simulator's namespace."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import queue
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import partial
 
 from rosbags.interfaces import Qos
@@ -94,10 +94,6 @@ class WriteBehind:
         else:
             self.lose(topic, 1)
         return fits
-
-    def note(self, name: str, values: Mapping[str, str]) -> None:
-        """Put a metadata record into the file."""
-        self._queue.put(partial(self._bag.note, name, values))
 
     def attach(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
         """Put a file into the bag."""

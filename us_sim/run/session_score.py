@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from us_sim.errors import BagError, ScoreError, UsSimError
-from us_sim.nodes.topics import FROZEN, MARKERS
+from us_sim.nodes.topics import FROZEN
 from us_sim.recording.path import POSE_STAMPED, ProbePath, is_tracker_recording, read_path
 from us_sim.recording.reader import Bag, read_bag
+from us_sim.recording.topic import MARKER
 from us_sim.run.session_summary import POSE, read_session, scene_of
 from us_sim.run.session_tables import SECOND, WRENCH_STAMPED, Progress, read_wrenches, topics_of
 from us_sim.scene.building import probe_of, volume_of
@@ -62,11 +63,11 @@ def read_scan(
         force = _read_force(bag, wrench, begin)
     except ScoreError as error:
         missing.append(f"force: {error}")
-    if f"/{MARKERS}" in types:
-        texts = [bag.deserialize(message).data for message in bag.messages([f"/{MARKERS}"])]
+    if f"/{MARKER}" in types:
+        texts = [bag.deserialize(message).data for message in bag.messages([f"/{MARKER}"])]
         frozen = sum(text.startswith(FROZEN) for text in texts)
     else:
-        missing.append(f"images that were frozen: {file} has no marks on /{MARKERS}")
+        missing.append(f"images that were frozen: {file} has no marks on /{MARKER}")
     try:
         truth = _measure_vessels(bag, path, progress)
     except UsSimError as error:

@@ -13,7 +13,8 @@ from std_srvs.srv import Trigger
 
 from us_sim.nodes.guarded_node import GuardedNode, shown
 from us_sim.nodes.qos import LATCHED, STREAM, overridable
-from us_sim.nodes.topics import FROZEN, MARKERS
+from us_sim.nodes.topics import FROZEN
+from us_sim.recording.topic import MARKER
 from us_sim.viewer.feeds import topic_feed
 from us_sim.viewer.stream import Packet, Posted, Simulator
 
@@ -31,7 +32,7 @@ def add_score(node: GuardedNode, post: Posted, simulator: Simulator) -> None:
         post: has work done in the thread that spins ``node``.
         simulator: what pages see.
     """
-    marks = node.create_publisher(String, MARKERS, STREAM, qos_overriding_options=overridable())
+    marks = node.create_publisher(String, MARKER, STREAM, qos_overriding_options=overridable())
     services = {name: node.create_client(Trigger, f"scorer/{name}") for name in ("clear", "draw")}
 
     def ask(what: str) -> None:
