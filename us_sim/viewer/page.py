@@ -20,9 +20,9 @@ from nicegui import ui
 from us_sim.errors import UsSimError
 from us_sim.slicing.settings import OVERLAYS, STRIPS
 from us_sim.viewer.export import LARGEST, exported, frames_of
-from us_sim.viewer.panels.exercise import build_exercise, told_score
+from us_sim.viewer.panels.exercise import ExercisePanel, told_score
 from us_sim.viewer.panels.nodes import build_image, build_plots, build_status, build_tissue
-from us_sim.viewer.panels.session import build_cases, build_session
+from us_sim.viewer.panels.session import CasesPanel, SessionPanel
 from us_sim.viewer.parameters import Kind
 from us_sim.viewer.session import SessionState
 from us_sim.viewer.stream import PageStream, Simulator
@@ -57,7 +57,9 @@ TISSUE = "tissue_deformer"
 _UNMOVED = 1e-5  # m, or of the face: by how much a place that was dragged may be as it was
 
 
-class _Modes:
+class ModeBar:
+    """The bar of the image's modes, strips and switches."""
+
     def __init__(self, simulator: Simulator) -> None:
         self._simulator = simulator
         self._mode = "b-mode"
@@ -204,11 +206,6 @@ def _absent(what: str, why: str, values: Mapping[str, str]) -> str:
     return f"{what}: {_ABSENT[why]}"
 
 
-def build_modes(simulator: Simulator) -> None:
-    """Make the bar inside the page."""
-    _Modes(simulator)
-
-
 def words_of(state: SessionState) -> tuple[str, str]:
     """The scene's name and a remark on it, which is often empty.
 
@@ -280,9 +277,9 @@ def _status(simulator: Simulator) -> None:
 PANELS = [
     ("Image", "contrast", "The scanner's console: depth, gain, focus and more", build_image),
     ("Tissue", "layers", "Method, materials, skin and tracker", build_tissue),
-    ("Cases", "collections", "Scenes and cases to load", build_cases),
-    ("Session", "radio_button_checked", "Record, and replay recordings", build_session),
-    ("Exercise", "school", "A task, what is done of it, and the score", build_exercise),
+    ("Cases", "collections", "Scenes and cases to load", CasesPanel),
+    ("Session", "radio_button_checked", "Record, and replay recordings", SessionPanel),
+    ("Exercise", "school", "A task, what is done of it, and the score", ExercisePanel),
     ("Status", "monitor_heart", "How every node is, and plots of the last minute", _status),
 ]
 """Name, icon of Material's, title, and the function that fills the tab."""
@@ -305,7 +302,7 @@ def build_page(simulator: Simulator) -> None:
             _block("scene")
             _block("hand")
         with _section("us-right", "Ultrasound"):
-            build_modes(simulator)
+            ModeBar(simulator)
             _block("ultrasound")
             _block("strips")
             _block("image-tools")

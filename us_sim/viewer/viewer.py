@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import declared
-from us_sim.nodes.process import run_node
+from us_sim.nodes.process import node_main
 from us_sim.settings.viewer import TOKEN, ViewerSettings
 from us_sim.viewer.access import is_loopback
 from us_sim.viewer.feeds import (
@@ -36,10 +35,7 @@ _IMAGED_WITH = ("gain", "dynamic_range", "focus")
 
 
 class Viewer(GuardedNode):
-    """A web server beside a node that subscribes only to topics that a page shows.
-
-    Its parameters are those of `ViewerSettings`.
-    """
+    """A web server beside a node that subscribes only to topics that a page shows."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("viewer", **kwargs)
@@ -117,10 +113,4 @@ class Viewer(GuardedNode):
         super().destroy_node()
 
 
-def main(args: list[str] | None = None) -> int:
-    """Serve until interrupted."""
-    return run_node(Viewer, args)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+main = node_main(Viewer, __name__)

@@ -128,8 +128,10 @@ def _round_number(number: float) -> float:
     return float(f"{factor * power:.6g}")
 
 
-class Control(Element):
-    """A control of one parameter, which sets one value at a time, and of several the last.
+class ParameterControl(Element, component="parameter_control.js"):
+    """A slider with a number field, a choice, a switch, or a text; read-only ones are shown.
+
+    It sets one value at a time, and of several the last.
 
     Args:
         node: whose parameter it is.
@@ -143,10 +145,12 @@ class Control(Element):
         self._node = node
         self._wanted: tuple[Any, int] | None = None  # a value, and the number of the change
         self._is_asking = False
+        self._span: SliderSpan | None = None
         self.props.update({"label": label or parameter.label, "tip": tip_of(parameter)})
         self.props.update({"reason": "", "seen": 0})
         self.props["data-parameter"] = f"{parameter.node}.{parameter.name}"
         self.on("change", self._on_change)
+        self._show()
 
     def show(self, parameter: Parameter) -> None:
         """Show another value, or another range."""
@@ -156,9 +160,6 @@ class Control(Element):
             self.props["reason"] = ""  # of another value
         self.parameter = parameter
         self._show()
-
-    def _show(self) -> None:
-        raise NotImplementedError
 
     async def _on_change(self, event: GenericEventArguments) -> None:
         self._wanted = event.args["value"], int(event.args["turn"])
@@ -175,15 +176,6 @@ class Control(Element):
             return
         self.parameter = self._node.parameters.get(self.parameter.name, self.parameter)
         self.props["seen"], self.props["reason"] = turn, reason
-        self._show()
-
-
-class ParameterControl(Control, component="parameter_control.js"):
-    """A slider with a number field, a choice, a switch, or a text; read-only ones are shown."""
-
-    def __init__(self, node: NodeParameters, parameter: Parameter, label: str = "") -> None:
-        super().__init__(node, parameter, label)
-        self._span: SliderSpan | None = None
         self._show()
 
     def _show(self) -> None:
@@ -250,16 +242,15 @@ def on_sliders(gains: Sequence[float], count: int) -> list[float]:
     return [round(float(gain), 6) for gain in shown]
 
 
-class TimeGain(Control, component="time_gain.js"):
+class TimeGain(ParameterControl, component="time_gain.js"):
     """One slider for the gain in dB at each of some depths, from the face to the beams' end."""
 
     REACH = 20.0  # dB up and down that the sliders cover, as consoles have it
 
     def __init__(self, node: NodeParameters, parameter: Parameter, label: str = "") -> None:
-        super().__init__(node, parameter, label)
         self._count = slider_count(parameter.value)
+        super().__init__(node, parameter, label)
         self._name_depths(100.0, "%")
-        self._show()
 
     def reach(self, depth: Parameter) -> None:
         """The beams end at this depth."""

@@ -33,7 +33,9 @@ _LOOKS = {
 _ALT = "The probe's way over the skin, with the force; force and areas of vessels over time"
 
 
-class _Panel:
+class ExercisePanel:
+    """The panel of an exercise: every page shows the same, so that a teacher sees a learner's."""
+
     def __init__(self, simulator: Simulator) -> None:
         self._simulator = simulator
         self._watched: list[Feed] = []
@@ -129,11 +131,6 @@ class _Panel:
             now = datetime.now().strftime("%Y-%m-%d-%H-%M-%S")
             page = result_page(told_score(self._simulator), self._drawn(), now)
             ui.download.content(page, f"us_sim-{now}.html", "text/html")
-
-
-def build_exercise(simulator: Simulator) -> None:
-    """Make the panel; every page shows the same, so that a teacher sees what a learner does."""
-    _Panel(simulator)
 
 
 def told_score(simulator: Simulator) -> Mapping[str, Any]:

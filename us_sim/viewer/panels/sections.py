@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from nicegui import ui
 from nicegui.element import Element
 
-from us_sim.viewer.panels.controls import Control, ParameterControl, TimeGain, WhileShown
+from us_sim.viewer.panels.controls import ParameterControl, TimeGain, WhileShown
 from us_sim.viewer.parameters import Parameter, in_words
 from us_sim.viewer.remote_parameters import THERE, NodeParameters, RemoteParameters
 
@@ -87,14 +87,14 @@ class ParameterSections:
     """
 
     def __init__(
-        self, node: NodeParameters, arrange: Arrange, special: Mapping[str, type[Control]]
+        self, node: NodeParameters, arrange: Arrange, special: Mapping[str, type[ParameterControl]]
     ) -> None:
         self.node, self._arrange, self._special = node, arrange, special
         self._seen: tuple[str, Mapping[str, Parameter]] | None = None
         self._layout: object = None  # of what was built
         self._is_open: dict[str, bool] = {}  # by titles
         self._boxes: dict[str, Element] = {}  # likewise
-        self._controls: dict[str, Control] = {}
+        self._controls: dict[str, ParameterControl] = {}
         self._state = ui.label().classes("us-note").props('role="status"')
         self._body = ui.element("div").classes("us-sections")
 
@@ -170,7 +170,7 @@ class ParameterSections:
 def build_parameters(
     nodes: RemoteParameters,
     *wanted: tuple[str, str, Arrange],
-    special: Mapping[str, type[Control]] | None = None,
+    special: Mapping[str, type[ParameterControl]] | None = None,
 ) -> WhileShown:
     """Make the sections of some nodes, followed while a person can see them.
 

@@ -22,7 +22,9 @@ EVERY_S = 0.3  # how often the panels are brought up to date
 BY_HAND = ("", "pose")  # trackers of scenes that differ from others in more than their tracker
 
 
-class _Cases:
+class CasesPanel:
+    """The panel of scenes and cases to load."""
+
     def __init__(self, simulator: Simulator) -> None:
         self._board = simulator.session
         self._shown: tuple[object, ...] = ()
@@ -118,11 +120,6 @@ def _told(state: SessionState) -> str:
     return f"{state.scene.replace('_', ' ')}: {state.state}{done}"
 
 
-def build_cases(simulator: Simulator) -> None:
-    """Make the panel."""
-    _Cases(simulator)
-
-
 SETTLE_S = 1.5  # from an answer until it is so; meanwhile controls stay as a person has set them
 RATES = {0.1: "0.1 ×", 0.25: "0.25 ×", 0.5: "0.5 ×", 1.0: "1 ×", 2.0: "2 ×", 4.0: "4 ×"}
 KINDS = {"path": "Probe's path", "recording": "All as recorded"}
@@ -132,7 +129,9 @@ KINDS_TOLD = (
 )
 
 
-class _Session:
+class SessionPanel:
+    """The panel that records, and replays recordings."""
+
     def __init__(self, simulator: Simulator) -> None:
         self._board = simulator.session
         self._sought: float | None = None  # s, where a person points at, until the replay is there
@@ -351,8 +350,3 @@ def recorded(state: SessionState) -> tuple[str, bool]:
 
 def _proposed() -> str:
     return f"session_{datetime.now():%Y%m%d_%H%M%S}.mcap"
-
-
-def build_session(simulator: Simulator) -> None:
-    """Make the panel."""
-    _Session(simulator)
