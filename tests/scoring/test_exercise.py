@@ -48,41 +48,8 @@ def done(name, seen, **task):
     return [step.is_done for step in steps(name, seen, **task)]
 
 
-def test_every_point_of_a_vein_that_was_closed_every_2_cm():
-    found = steps("compression", scan())
-    assert [step.is_done for step in found] == [True] * 3
-    assert np.allclose([step.target[0] for step in found], LINE.points[[10, 30, 50]])
-    assert all("6.0 N" in step.seen for step in found)
-
-
-def test_a_point_that_was_missed_or_not_closed_is_not_done():
-    found = steps("compression", scan(points=(0.01, 0.03, 0.04)))
-    assert [step.is_done for step in found] == [True, True, False]
-    found = steps("compression", scan(left=(0.0, 0.3, 0.3)))
-    assert [step.is_done for step in found] == [True, False, False]
-    assert [step.is_missed for step in found] == [False, True, False]  # the probe is at the last
-    hard = (6.0, 20.0, 6.0)  # and no thrombus there
-    assert done("compression", scan(left=(0.0, 0.3, 0.0), newtons=hard)) == [True, False, True]
-
-
-def test_a_thrombus_is_found_by_pressing_hard_where_it_is():
-    seen = replace(scan(left=(0.0, 0.3, 0.0), newtons=(6, 12, 6)), thrombi={"vein": (0.028, 0.034)})
-    assert done("compression", seen) == [True, True, True]
-    soft = replace(scan(left=(0.0, 0.3, 0.0)), thrombi={"vein": (0.028, 0.034)})
-    assert done("compression", soft) == [True, False, True]
-
-
-def test_the_artery_must_stay_open_when_the_vein_closes():
-    assert done("compression", scan(artery=(0.9, 0.2, 0.9))) == [True, False, True]
-    assert done("compression", scan(artery=(0.9, 0.2, 0.9)), artery=None) == [True] * 3
-    again = scan(points=(*POINTS, POINTS[1]), left=(0,) * 4, artery=(0.9, 0.2, 0.9, 0.9))
-    assert done("compression", again) == [True] * 3
-
-
-def test_without_force_a_closed_vein_is_still_closed():
-    seen = replace(scan(left=(0.0, 0.3, 0.0)), force=None)
-    assert done("compression", seen) == [True, False, True]
-    assert done("keep_force", seen) == [False]
+def test_without_force_none_is_kept():
+    assert done("keep_force", replace(scan(), force=None)) == [False]
 
 
 def test_a_force_is_kept_as_long_as_it_does_not_leave_its_range():

@@ -47,6 +47,8 @@ def messages(seed, seconds):
     times = np.cumsum(random.uniform(0.5, 1.5, RATE * seconds)) / RATE
     places = np.cumsum(random.normal(0, 0.5, (len(times) // RATE + 2, 2)), axis=0) * [3, 12]
     depth = np.clip(np.sin(times * random.uniform(0.5, 2.0)) * 1.5, 0.0, 1.0)
+    depth[times > 1.0] = np.maximum(depth[times > 1.0], 0.05)  # it lies on the skin
+    depth[times < 0.5] = 0.0  # and was in the air before
     depth[(times > 0.4 * seconds) & (times < 0.6 * seconds)] = 1.0  # held closed
     holds = (times > 0.6 * seconds) & (times < 0.9 * seconds)  # 4.8 N, the artery in the middle
     depth[holds] = 0.4
@@ -86,13 +88,16 @@ def test_the_score_so_far_is_that_of_all_samples_so_far(name):
     exercise = read_exercise(name)
     told = set()
     for scan in scanned(exercise, 1, 24):
-        metrics, steps = scan.score()
+        metrics, steps, faults, seconds = scan.score()
         whole = scan.scan()
+        attempt = exercise.begin(whole.lines)
+        attempt.add(whole)
+        assert (faults, seconds) == (attempt.faults(), attempt.seconds())
         expected = list(metrics_of(whole))
         assert [each.label for each in metrics] == [each.label for each in expected]
         for found, known in zip(metrics, expected, strict=True):
             assert found.value == pytest.approx(known.value, rel=1e-9, nan_ok=True), found.label
-        for step, known in zip(steps, exercise.steps(whole), strict=True):
+        for step, known in zip(steps, attempt.steps(), strict=True):
             assert step[:3] == known[:3]
             told.add(step.seen)
     assert len(told) >= 3  # something went on

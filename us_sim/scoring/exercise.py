@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -30,11 +30,11 @@ from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import unknown
 from us_sim.settings.text_files import read_yaml
 from us_sim.share import shared_roots
-from us_sim.slicing.settings import WALLS_TOUCH
 
-_LENGTH, _TIME, _FORCE = Quantity("length", 1e-4, 1.0), Quantity("time", 0.1, 3600.0), "force"
-_PART = Quantity("number", 0.0, 1.0)
-_PRESSED = 0.9  # part of a vein's area below which it was pressed, and not only passed
+LENGTH, PART = Quantity("length", 1e-4, 1.0), Quantity("number", 0.0, 1.0)
+_TIME, _FORCE = Quantity("time", 0.1, 3600.0), "force"
+IN_AIR = 0.1
+"""N, below which the probe touches nothing."""
 _MM = 1e3
 
 
@@ -50,8 +50,18 @@ class Step(NamedTuple):
     is_missed: bool = False  # whether it was tried in vain, and the probe has moved on
 
 
+class Fault(NamedTuple):
+    """Something that was done wrong."""
+
+    time: float  # s since the first pose
+    what: str
+
+
 class Attempt(ABC):
     """An attempt at a task: a scan is added to it whole, or in pieces one after another."""
+
+    ended: float | None = None
+    """s since the first pose, when all was done or the time was over; None before."""
 
     @abstractmethod
     def add(self, scan: Scan) -> None:
@@ -59,7 +69,62 @@ class Attempt(ABC):
 
     @abstractmethod
     def steps(self) -> list[Step]:
-        """Every thing that is to be done."""
+        """Return every thing that is to be done."""
+
+    def faults(self) -> list[Fault]:
+        """Return what was done wrong, in order."""
+        return []
+
+
+class TimedAttempt(Attempt):
+    """An attempt that begins when the probe is in the air for the first time.
+
+    A scene may be loaded, or an attempt begun anew, under a probe that presses already. A scan
+    without force begins at once, since nobody knows when it touches.
+
+    Args:
+        attempt: at the task.
+    """
+
+    def __init__(self, attempt: Attempt) -> None:
+        self._attempt = attempt
+        self._has_begun = False
+        self._touched: float | None = None  # s
+        self._time = 0.0  # s, of the last pose
+
+    def add(self, scan: Scan) -> None:
+        """Take the samples that are new, from the first in the air on."""
+        if scan.force is not None and not self._has_begun:
+            new = scan.force.times > scan.since
+            in_air = scan.force.times[new & (scan.force.newtons < IN_AIR)]
+            if not len(in_air):
+                return
+            since = float(np.nextafter(in_air[0], -np.inf))
+            scan = replace(scan, since=max(scan.since, since))
+            self._has_begun = True
+        self._time = float(scan.motion.times[-1])
+        if self._touched is None:
+            times = scan.motion.times
+            if scan.force is not None:
+                times = scan.force.times[scan.force.newtons >= IN_AIR]
+            new_times = times[times > scan.since]
+            self._touched = float(new_times[0]) if len(new_times) else None
+        self._attempt.add(scan)
+
+    def steps(self) -> list[Step]:
+        """Return every thing that is to be done."""
+        return self._attempt.steps()
+
+    def faults(self) -> list[Fault]:
+        """Return what was done wrong, in order."""
+        return self._attempt.faults()
+
+    def seconds(self) -> float | None:
+        """Return the time from the first touch to the end, or so far; None before the first."""
+        if self._touched is None:
+            return None
+        ended = self._attempt.ended
+        return (self._time if ended is None else ended) - self._touched
 
 
 class Task(Settings):
@@ -79,137 +144,32 @@ class Task(Settings):
 
 
 class _Hold:
-    """The longest time (s) for which something was held without a break."""
+    """How long (s) something was held without a break.
 
-    def __init__(self) -> None:
-        self.longest = self._held = 0.0
+    Args:
+        duration: that is wanted.
+    """
+
+    def __init__(self, duration: float) -> None:
+        self.longest = self.held = 0.0
+        self.reached: float | None = None  # s, when it had been held for the duration
+        self._duration = duration
         self._last, self._was = 0.0, False
 
     def add(self, times: NDArray[np.float64], within: NDArray[np.bool_]) -> None:
         for time, now in zip(times.tolist(), within.tolist(), strict=True):
-            self._held = self._held + time - self._last if now and self._was else 0.0
-            self.longest = max(self.longest, self._held)
+            self.held = self.held + time - self._last if now and self._was else 0.0
+            self.longest = max(self.longest, self.held)
+            if self.reached is None and self.longest >= self._duration:
+                self.reached = time
             self._last, self._was = time, now
 
-
-@dataclass(frozen=True)
-class Compression(Task):
-    """Compress a vein point by point, as in an examination for thrombosis.
-
-    Each point is closed completely, which a thrombus prevents: there it is enough to have pressed
-    hard. Every 2 cm is the interval of Needleman et al., "Ultrasound for lower extremity deep
-    venous thrombosis", Circulation 137 (2018).
-    """
-
-    structure: str = setting(description="vein to be compressed", default="vein")
-    artery: str | None = setting(description="artery that must stay open", default=None)
-    spacing: float = setting(_LENGTH, "between points along the vein", default=0.02)
-    margin: float = setting(Quantity("length", 0.0, 1.0), "left out at both ends", default=0.008)
-    tolerance: float = setting(_LENGTH, "from a point, within which it counts", default=0.005)
-    closed: float = setting(
-        _PART, "part of its area that a closed vein may keep", default=WALLS_TOUCH
-    )
-    open: float = setting(_PART, "part of its area that the artery must keep", default=0.5)
-    enough: float = setting(
-        Quantity(_FORCE, 0.1, 200.0),
-        "after which a vein that is still open holds a thrombus",
-        default=10.0,
-    )
-
-    @property
-    def structures(self) -> tuple[str, ...]:
-        """The vein, and the artery where one is named."""
-        return (self.structure, *([self.artery] if self.artery else []))
-
-    def points(self, length: float) -> NDArray[np.float64]:
-        """(N,) m along a vein of that length, the first in the middle of what is over."""
-        room = max(length - 2 * self.margin, 0.0)
-        count = int(room / self.spacing + 1e-9) + 1
-        return np.asarray(
-            0.5 * length + self.spacing * (np.arange(count) - 0.5 * (count - 1)), np.float64
-        )
-
-    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:
-        """An attempt with a step for each point."""
-        line = lines[self.structure]
-        points = self.points(float(line.lengths[-1])).tolist()
-        return _Points([_Point(self, at, line.at(at)) for at in points])
-
-
-class _Points(Attempt):
-    def __init__(self, points: list[_Point]) -> None:
-        self._points = points
-
-    def add(self, scan: Scan) -> None:
-        for point in self._points:
-            point.add(scan)
-
-    def steps(self) -> list[Step]:
-        return [point.step() for point in self._points]
-
-
-class _Point:
-    """A point of a vein, and all that was seen around it.
-
-    Args:
-        task: with the limits.
-        at: m along the vein.
-        place: (3,) m, the same in frame ``patient``.
-    """
-
-    def __init__(self, task: Compression, at: float, place: NDArray[np.float64]) -> None:
-        self._task, self._at, self._place = task, at, place
-        self._closed: tuple[float, float] | None = None  # N, and the part of the artery left open
-        self._least, self._force = np.inf, np.nan  # part that was open at least, and N then
-        self._most = 0.0  # N, of all images
-        self._is_thrombus = self._is_here = False
-
-    def add(self, scan: Scan) -> None:
-        task = self._task
-        begin, end = scan.thrombi.get(task.structure, (np.inf, -np.inf))
-        self._is_thrombus = begin - task.tolerance <= self._at <= end + task.tolerance
-        section = scan.sections.get(task.structure)
-        if section is None:
-            return
-        new = section.times > scan.since
-        is_near = np.abs(section.along - self._at) <= task.tolerance
-        self._is_here = bool(is_near[new][-1]) if new.any() else self._is_here
-        near = np.flatnonzero(new & is_near & np.isfinite(section.fraction))
-        if not len(near):
-            return
-        left = section.fraction[near]
-        force = scan.force.at(section.times[near]) if scan.force else np.full(len(near), np.nan)
-        least = int(np.argmin(left))
-        if left[least] < self._least:
-            self._least, self._force = float(left[least]), float(force[least])
-        self._most = max(self._most, float(np.nan_to_num(force).max()))
-        artery = scan.sections.get(task.artery or "")
-        for k in np.flatnonzero(left <= task.closed).tolist():
-            part = float(artery.fraction[near[k]]) if artery is not None else 1.0
-            part = part if np.isfinite(part) else 1.0  # nobody knows
-            if self._closed is None or (self._closed[1] < task.open <= part):
-                self._closed = float(force[k]), part
-
-    def step(self) -> Step:
-        task = self._task
-        is_done, seen = self._seen()
-        is_missed = not is_done and not self._is_here and self._least < _PRESSED
-        what = f"{task.structure} at {_MM * self._at:.0f} mm"
-        return Step(what, is_done, seen, self._place[None], is_missed=is_missed)
-
-    def _seen(self) -> tuple[bool, str]:
-        task = self._task
-        if self._closed is not None:
-            force, artery = self._closed
-            is_open = artery >= task.open
-            also = "" if is_open else f", and of the {task.artery} {100 * artery:.0f} % were left"
-            return is_open, f"closed{_newtons(force)}{also}"
-        if self._least == np.inf:
-            return False, "not reached"
-        seen = f"{100 * self._least:.0f} % open{_newtons(self._force)}"
-        if self._most < task.enough:
-            return False, f"{seen}: press harder"
-        return self._is_thrombus, f"{seen}: {'a thrombus' if self._is_thrombus else 'not closed'}"
+    def step(self, what: str) -> Step:
+        """Return the step, with how long it is held now and was at most."""
+        seen = f"held for {self.longest:.1f} s"
+        if self.reached is None and self.held < self.longest:
+            seen = f"held for {self.held:.1f} s, {self.longest:.1f} s at most"
+        return Step(what, self.reached is not None, seen)
 
 
 @dataclass(frozen=True)
@@ -227,21 +187,24 @@ class KeepForce(Task):
 
 class _KeptForce(Attempt):
     def __init__(self, task: KeepForce) -> None:
-        self._task, self._hold, self._is_known = task, _Hold(), False
+        self._task, self._hold = task, _Hold(task.duration)
+        self._newtons: float | None = None  # the last
 
     def add(self, scan: Scan) -> None:
         if scan.force is not None:
-            self._is_known = True
             new = scan.force.times > scan.since
             within = np.abs(scan.force.newtons - self._task.force) <= self._task.tolerance
             self._hold.add(scan.force.times[new], within[new])
+            self._newtons, self.ended = float(scan.force.newtons[-1]), self._hold.reached
 
     def steps(self) -> list[Step]:
         task = self._task
         what = f"{task.force:g} ± {task.tolerance:g} N for {task.duration:g} s"
-        if not self._is_known:
+        if self._newtons is None:
             return [Step(what, False, "the recording has no force")]
-        return [_held(what, self._hold, task.duration)]
+        step = self._hold.step(what)
+        now = "" if step.is_done else f"{self._newtons:.1f} N now; "
+        return [step._replace(seen=now + step.seen)]
 
 
 @dataclass(frozen=True)
@@ -249,7 +212,7 @@ class Centre(Task):
     """Bring a vessel to the middle of the image and hold it there."""
 
     structure: str = setting(description="vessel to be centred", default="vein")
-    offset: float = setting(_LENGTH, "from the image's middle at most", default=0.003)
+    offset: float = setting(LENGTH, "from the image's middle at most", default=0.003)
     duration: float = setting(_TIME, "without losing it", default=3.0)
 
     @property
@@ -264,7 +227,8 @@ class Centre(Task):
 
 class _Centred(Attempt):
     def __init__(self, task: Centre, line: CentreLine) -> None:
-        self._task, self._line, self._hold, self._is_seen = task, line, _Hold(), False
+        self._task, self._line, self._is_seen = task, line, False
+        self._hold = _Hold(task.duration)
 
     def add(self, scan: Scan) -> None:
         section = scan.sections.get(self._task.structure)
@@ -273,13 +237,14 @@ class _Centred(Attempt):
             self._is_seen |= bool(np.isfinite(section.fraction[new]).any())
             within = _is_centred(section, self._task.offset)
             self._hold.add(section.times[new], within[new])
+            self.ended = self._hold.reached
 
     def steps(self) -> list[Step]:
         task, points = self._task, self._line.points
         what = f"{task.structure} within {_MM * task.offset:g} mm for {task.duration:g} s"
         if not self._is_seen:
             return [Step(what, False, "never in the image", points)]
-        return [_held(what, self._hold, task.duration)._replace(target=points)]
+        return [self._hold.step(what)._replace(target=points)]
 
 
 @dataclass(frozen=True)
@@ -287,9 +252,9 @@ class Follow(Task):
     """Follow a vessel, keeping it in the middle of the image."""
 
     structure: str = setting(description="vessel to be followed", default="vein")
-    offset: float = setting(_LENGTH, "from the image's middle at most", default=0.005)
+    offset: float = setting(LENGTH, "from the image's middle at most", default=0.005)
     margin: float = setting(Quantity("length", 0.0, 1.0), "left out at both ends", default=0.01)
-    part: float = setting(_PART, "of the rest that has to be seen", default=0.9)
+    part: float = setting(PART, "of the rest that has to be seen", default=0.9)
 
     @property
     def structures(self) -> tuple[str, ...]:
@@ -316,15 +281,23 @@ class _Followed(Attempt):
             return
         new = section.times > scan.since
         centred = _is_centred(section, self._task.offset)[new]
-        for along, now in zip(section.along[new].tolist(), centred.tolist(), strict=True):
+        looks = zip(section.times[new].tolist(), section.along[new].tolist(), centred, strict=True)
+        for time, along, now in looks:
             if now:
                 last = self._last if self._last is not None else along
                 low, high = sorted((last, along))
                 self._seen |= (self._pieces > low - 0.002) & (self._pieces < high + 0.002)
+                if self.ended is None and self._part >= self._task.part:
+                    self.ended = time
             self._last = along if now else None
 
+    @property
+    def _part(self) -> float:
+        """Of the vessel, that was seen."""
+        return float(self._seen.mean()) if len(self._seen) else 0.0
+
     def steps(self) -> list[Step]:
-        part = float(self._seen.mean()) if len(self._seen) else 0.0
+        part = self._part
         what = f"{100 * self._task.part:.0f} % of the {self._task.structure} in the image's middle"
         return [Step(what, part >= self._task.part, f"{100 * part:.0f} % seen", self._line.points)]
 
@@ -334,7 +307,7 @@ class View(Task):
     """Find a standard view: a pose of the probe, with vessels that must be in the image."""
 
     pose: Placement = setting(description="of the probe, in frame patient")
-    distance: float = setting(_LENGTH, "from its position at most", default=0.005)
+    distance: float = setting(LENGTH, "from its position at most", default=0.005)
     angle: float = setting(Quantity("angle", 1e-3, 3.15), "from its orientation", default=0.17)
     visible: tuple[str, ...] = setting(description="vessels in the image", default=())
     duration: float = setting(_TIME, "without leaving it", default=1.0)
@@ -351,7 +324,7 @@ class View(Task):
 
 class _Found(Attempt):
     def __init__(self, task: View) -> None:
-        self._task, self._hold = task, _Hold()
+        self._task, self._hold = task, _Hold(task.duration)
         self._nearest = np.inf, np.inf, np.inf  # how far in all, m, rad
 
     def add(self, scan: Scan) -> None:
@@ -372,6 +345,7 @@ class _Found(Attempt):
             last = np.searchsorted(section.times, times, side="right") - 1  # image
             within &= (last >= 0) & (section.area[last] > 0)
         self._hold.add(times, within)
+        self.ended = self._hold.reached
         best = int(np.argmin(apart / task.distance + turned / task.angle))
         far = apart[best] / task.distance + turned[best] / task.angle
         self._nearest = min(self._nearest, (far, apart[best], turned[best]))
@@ -379,7 +353,7 @@ class _Found(Attempt):
     def steps(self) -> list[Step]:
         task = self._task
         what = f"the view within {_MM * task.distance:g} mm and {np.rad2deg(task.angle):.0f}°"
-        held = _held(f"{what} for {task.duration:g} s", self._hold, task.duration)
+        held = self._hold.step(f"{what} for {task.duration:g} s")
         _, apart, turned = self._nearest
         if np.isfinite(apart):
             near = f"nearest {_MM * apart:.1f} mm and {np.rad2deg(turned):.0f}°"
@@ -403,8 +377,8 @@ class Exercise(Settings):
         """The task with its settings."""
         return self.task.settings(EXERCISES)
 
-    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:
-        """An attempt at it, in a scene with these vessels.
+    def begin(self, lines: Mapping[str, CentreLine]) -> TimedAttempt:
+        """Return an attempt at it, in a scene with these vessels.
 
         Raises:
             ScoreError: some that the task needs are missing; one sentence with the structure.
@@ -414,8 +388,7 @@ class Exercise(Settings):
                 known = unknown(name, lines) if lines else f"{name!r} is not known"
                 of = "the vessels of the scene" if lines else "a scan without a scene"
                 raise ScoreError(f"exercise {self.name}: in {of} the structure {known}")
-        attempt: Attempt = self.assigned.begin(lines)
-        return attempt
+        return TimedAttempt(self.assigned.begin(lines))
 
     def steps(self, scan: Scan) -> list[Step]:
         """Steps to be done, with what was seen of each in a whole scan.
@@ -452,14 +425,6 @@ def result_of(done: Sequence[bool]) -> str:
     return f"{'passed' if all(done) else 'not passed'}: {sum(done)} of {len(done)} done"
 
 
-def _newtons(force: float) -> str:
-    return f" at {force:.1f} N" if np.isfinite(force) else ""
-
-
 def _is_centred(section: Section, offset: float) -> NDArray[np.bool_]:
     with np.errstate(invalid="ignore"):
         return np.asarray(np.abs(section.lateral) <= offset)
-
-
-def _held(what: str, hold: _Hold, duration: float) -> Step:
-    return Step(what, hold.longest >= duration, f"held for {hold.longest:.1f} s")

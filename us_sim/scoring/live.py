@@ -7,13 +7,15 @@ of the last seconds are added anew each time, to a copy.
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Sequence
 from copy import deepcopy
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
-from us_sim.scoring.exercise import Attempt, Exercise, Step
+from us_sim.scoring.exercise import Attempt, Exercise, Fault, Step
 from us_sim.scoring.lumen import LumenMeter, lumens_of, vessels_in
 from us_sim.scoring.metrics import Force, Metric, Scan, Tally
 from us_sim.scoring.motion import Motion
@@ -23,6 +25,15 @@ from us_sim.volume.volume import Volume
 
 _LATE = 2.0
 """s after its pose, from which on a force or an image that comes is passed over."""
+
+
+class Score(NamedTuple):
+    """What is told of a scan."""
+
+    metrics: list[Metric]
+    steps: Sequence[Step] = ()
+    faults: Sequence[Fault] = ()
+    seconds: float | None = None  # from the first touch to the end, or so far; None before
 
 
 class LiveScan:
@@ -108,15 +119,18 @@ class LiveScan:
         sections = self._meter.sections(*_span(self._meter.times, since, until, 1))
         return Scan(motion, force, sections, self.lines, self._thrombi, width, since=since)
 
-    def score(self) -> tuple[list[Metric], list[Step]] | None:
-        """Metrics and steps so far; None before there is a motion."""
+    def score(self) -> Score | None:
+        """Return the score so far; None before there is a motion."""
         self._settle()
         scan = self.scan(self._settled)
         if scan is None:
             return None
         tally, attempt = deepcopy((self._tally, self._attempt))
         _add(tally, attempt, scan)
-        return list(tally.metrics()), attempt.steps() if attempt is not None else []
+        metrics = list(tally.metrics())
+        if attempt is None:
+            return Score(metrics)
+        return Score(metrics, attempt.steps(), attempt.faults(), attempt.seconds())
 
     def _settle(self) -> None:
         """Add what later samples cannot change any more."""

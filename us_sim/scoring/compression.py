@@ -1,0 +1,355 @@
+"""Compression of a vein point by point, as in an examination for thrombosis.
+
+A point counts when the vein was seen open there, was closed there by a press that kept its place,
+and was let go. A thrombus keeps a vein from closing: there it is enough to have pressed hard.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import ScoreError
+from us_sim.scoring.centre_line import CentreLine
+from us_sim.scoring.exercise import IN_AIR, LENGTH, PART, Attempt, Fault, Step, Task
+from us_sim.scoring.metrics import Scan
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import setting
+from us_sim.slicing.settings import WALLS_TOUCH
+
+_FORCE = Quantity("force", 0.1, 200.0)
+_LOOKED = 0.3  # s, for which a person must see a vein open, or closed, to be sure of it
+_LIGHT = 3.0  # N, below which a probe lies on the skin and does not press
+_MM = 1e3
+
+
+@dataclass(frozen=True)
+class Compression(Task):
+    """Compress a vein point by point.
+
+    Every 2 cm is the interval of Needleman et al., "Ultrasound for lower extremity deep venous
+    thrombosis", Circulation 137 (2018).
+    """
+
+    structure: str = setting(description="vein to be compressed", default="vein")
+    artery: str | None = setting(description="artery that must stay open", default=None)
+    points: tuple[float, ...] | int | None = setting(
+        Quantity("length", 0.0, 100.0),
+        "number of points, or their places along the vein; not given: as many as there is room for",
+        default=None,
+    )
+    spacing: float = setting(LENGTH, "between points along the vein", default=0.02)
+    margin: float = setting(Quantity("length", 0.0, 1.0), "left out at both ends", default=0.008)
+    tolerance: float = setting(
+        LENGTH,
+        "from a point, within which it counts, and within which a press stays",
+        default=0.005,
+    )
+    closed: float = setting(
+        PART, "part of its area that a closed vein may keep", default=WALLS_TOUCH
+    )
+    open: float = setting(PART, "part of its area from which a vessel counts as open", default=0.5)
+    enough: float = setting(
+        _FORCE, "after which a vein that is still open holds a thrombus", default=10.0
+    )
+    force_limit: float = setting(_FORCE, "above which a press does not count", default=20.0)
+    lift_between: bool = setting(
+        description="whether the probe must leave the skin between two presses; else it is enough "
+        "that the vein is open again",
+        default=False,
+    )
+    time_limit: float | None = setting(
+        Quantity("time", 1.0, 36000.0), "from the first touch to the last point", default=None
+    )
+
+    @property
+    def structures(self) -> tuple[str, ...]:
+        """The vein, and the artery where one is named."""
+        return (self.structure, *([self.artery] if self.artery else []))
+
+    def check(self) -> None:
+        """Refuse a task without a point."""
+        if self.points in ((), 0):
+            raise self.refused("points", "is empty: name at least one")
+
+    def places(self, length: float) -> NDArray[np.float64]:
+        """Return the points (N,), m along a vein of that length.
+
+        Raises:
+            ScoreError: a place that was given is not on the vein.
+        """
+        if isinstance(self.points, tuple):
+            if max(self.points) > length:
+                raise ScoreError(
+                    f"task.points: {_MM * max(self.points):.0f} mm is not on the {self.structure}, "
+                    f"which is {_MM * length:.0f} mm long"
+                )
+            return np.array(self.points)
+        room = max(length - 2 * self.margin, 0.0)
+        count = self.points or int(room / self.spacing + 1e-9) + 1
+        spacing = self.spacing if self.points is None else room / max(count - 1, 1)
+        return np.asarray(
+            0.5 * length + spacing * (np.arange(count) - 0.5 * (count - 1)), np.float64
+        )
+
+    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:
+        """Return an attempt with a step for each point, and one for the time if it is limited."""
+        line = lines[self.structure]
+        places = self.places(float(line.lengths[-1])).tolist()
+        return _Examination(self, [_Point(at, line.at(at)) for at in places])
+
+
+class _Look(NamedTuple):
+    """One image in which the vein was measured."""
+
+    time: float  # s
+    along: float  # m, of the place on the vein; NaN where the image does not cut it
+    part: float  # of its area at rest; NaN where nobody knows
+    force: float  # N; NaN without force
+    peak: float  # N, the most since the image before
+    artery: float  # part of the artery's area at rest; 1 where nobody knows
+
+    @property
+    def touches(self) -> bool:
+        return not self.force < IN_AIR
+
+    def presses(self, is_open: float) -> bool:
+        """Return whether the vein is pressed, by its area or by the force."""
+        return self.touches and (self.part < is_open or self.force >= _LIGHT)
+
+
+@dataclass
+class _Point:
+    """A point of the vein, and what became of it."""
+
+    at: float  # m along the vein
+    place: NDArray[np.float64]  # (3,) m, the same in frame ``patient``
+    is_done: bool = False
+    seen: str = "not reached"
+    is_tried: bool = False
+
+
+@dataclass
+class _Press:
+    """A press, until the probe lies on the skin lightly again, with the vein open."""
+
+    along: float  # m, where it began
+    problem: str = ""  # why it does not count
+    has_slid: bool = False
+    least: float = np.inf  # part that was open at least
+    force: float = np.nan  # N then
+    most: float = 0.0  # N
+    closed: tuple[float, float] | None = None  # N, and the part of the artery that was open
+    _closed_since: float | None = field(default=None, repr=False)  # s
+
+    def add(self, look: _Look, task: Compression) -> None:
+        """Take an image of it."""
+        self.most = max(self.most, float(np.nan_to_num(look.peak)))
+        if look.part < self.least:
+            self.least, self.force = look.part, look.force
+        if not look.part <= task.closed:
+            self._closed_since = None
+            return
+        if self._closed_since is None:
+            self._closed_since = look.time
+        is_better = self.closed is None or self.closed[1] < task.open <= look.artery
+        if look.time - self._closed_since >= _LOOKED and is_better:
+            self.closed = look.force, look.artery
+
+
+class _Examination(Attempt):
+    """All presses of an attempt, in the order of its images.
+
+    Args:
+        task: with the limits.
+        points: of the vein.
+    """
+
+    def __init__(self, task: Compression, points: list[_Point]) -> None:
+        self._task, self._points = task, points
+        self._press: _Press | None = None
+        self._open: tuple[float, float] | None = None  # s since when, and m where it is seen open
+        self._was_lifted = True  # since the last press
+        self._along = np.nan  # m, of the last image
+        self._time = -np.inf  # s, likewise
+        self._is_over = False  # whether the force is over its limit
+        self._begin: float | None = None  # s, of the first touch
+        self._thrombus = np.inf, -np.inf  # m, from and to
+        self._faults: list[Fault] = []
+
+    def add(self, scan: Scan) -> None:
+        """Take the images that are new."""
+        task = self._task
+        self._thrombus = scan.thrombi.get(task.structure, self._thrombus)
+        section, artery = (scan.sections.get(name or "") for name in (task.structure, task.artery))
+        if section is None:
+            return
+        force = scan.force.at(section.times) if scan.force else np.full(len(section.times), np.nan)
+        for k in np.flatnonzero(section.times > scan.since).tolist():
+            if self.ended is not None:
+                return
+            time, peak = float(section.times[k]), float(force[k])
+            if scan.force is not None:
+                times = scan.force.times
+                between = scan.force.newtons[(times > self._time) & (times <= time)]
+                peak = float(between.max(initial=np.nan_to_num(peak)))
+            open_artery = float(artery.fraction[k]) if artery is not None else np.nan
+            self._take(
+                _Look(
+                    time,
+                    float(section.along[k]),
+                    float(section.fraction[k]),
+                    float(force[k]),
+                    peak,
+                    open_artery if np.isfinite(open_artery) else 1.0,
+                )
+            )
+            self._time = time
+
+    def steps(self) -> list[Step]:
+        """Return one step for each point, and one for the time if it is limited."""
+        pressed = self._pressed()
+        steps = []
+        for number, point in enumerate(self._points, 1):
+            seen = self._tell_press() if point is pressed and not point.is_done else point.seen
+            is_here = abs(self._along - point.at) <= self._task.tolerance
+            steps.append(
+                Step(
+                    f"{number}: {self._task.structure} at {_MM * point.at:.0f} mm",
+                    point.is_done,
+                    seen,
+                    point.place[None],
+                    is_missed=point.is_tried and not point.is_done and not is_here,
+                )
+            )
+        return [*steps, *self._steps_of_time()]
+
+    def faults(self) -> list[Fault]:
+        """Return what was done wrong."""
+        return self._faults
+
+    def _steps_of_time(self) -> list[Step]:
+        limit = self._task.time_limit
+        if limit is None:
+            return []
+        seconds = self._seconds(self._time if self.ended is None else self.ended)
+        is_kept = seconds <= limit
+        return [Step(f"within {limit:g} s", is_kept, f"{seconds:.0f} s", is_missed=not is_kept)]
+
+    def _seconds(self, now: float) -> float:
+        """Return the time since the first touch."""
+        return 0.0 if self._begin is None else now - self._begin
+
+    def _take(self, look: _Look) -> None:
+        task = self._task
+        if look.touches and self._begin is None:
+            self._begin = look.time
+        if task.time_limit and (self._seconds(look.time) > task.time_limit):
+            self.ended = look.time
+            return
+        self._along = look.along if np.isfinite(look.along) else self._along
+        presses = look.presses(task.open)
+        if self._press is None and presses:
+            self._press = _Press(look.along, self._early(look))
+        if self._press is not None:
+            self._press.add(look, task)
+            self._check_place(look, self._press)
+        self._check_force(look)
+        self._was_lifted |= not look.touches
+        if self._press is not None and not presses:
+            self._finish(self._press)
+        self._see_open(look)
+        if all(point.is_done for point in self._points):
+            self.ended = look.time
+
+    def _see_open(self, look: _Look) -> None:
+        """Note since when, and where, the vein is seen open."""
+        if not look.touches or look.presses(self._task.open):
+            self._open = None
+            return
+        is_elsewhere = self._open and abs(look.along - self._open[1]) > self._task.tolerance
+        if look.part >= self._task.open and (self._open is None or is_elsewhere):
+            self._open = look.time, look.along
+
+    def _early(self, look: _Look) -> str:
+        """Return why a press that begins does not count; "" if it does so far."""
+        if self._task.lift_between and not self._was_lifted:
+            return "pressed again without a lift: lift the probe between two presses"
+        if self._open is not None:
+            since, along = self._open
+            is_there = abs(look.along - along) <= self._task.tolerance
+            if is_there and self._time - since >= _LOOKED:
+                return ""
+        return "pressed before the vein was seen open there: touch lightly first"
+
+    def _check_place(self, look: _Look, press: _Press) -> None:
+        slid = abs(look.along - press.along)
+        if look.touches and slid > self._task.tolerance and not press.has_slid:
+            press.has_slid = True
+            press.problem = f"slid {_MM * slid:.0f} mm under pressure: let go before you slide on"
+            self._faults.append(Fault(look.time, press.problem))
+
+    def _check_force(self, look: _Look) -> None:
+        limit = self._task.force_limit
+        was_over, self._is_over = self._is_over, look.peak > limit
+        if not self._is_over:
+            return
+        problem = f"{look.peak:.1f} N, over {limit:g} N: press less"
+        if not was_over:
+            self._faults.append(Fault(look.time, problem))
+        if self._press is not None and not self._press.problem:
+            self._press.problem = problem
+
+    def _pressed(self) -> _Point | None:
+        """Return the point that the press is at."""
+        if self._press is None:
+            return None
+        nearest = min(self._points, key=lambda point: abs(point.at - self._press.along))
+        is_there = abs(nearest.at - self._press.along) <= self._task.tolerance
+        return nearest if is_there else None
+
+    def _finish(self, press: _Press) -> None:
+        """Have the point that the press was at know what became of it."""
+        point = self._pressed()
+        self._press, self._was_lifted = None, False
+        if point is None or point.is_done:
+            return
+        point.is_tried = True
+        point.is_done, point.seen = self._judge(press, point)
+
+    def _judge(self, press: _Press, point: _Point) -> tuple[bool, str]:
+        task = self._task
+        if press.problem:
+            return False, press.problem
+        if press.closed is not None:
+            force, artery = press.closed
+            is_open = artery >= task.open
+            also = "" if is_open else f", and of the {task.artery} {100 * artery:.0f} % were left"
+            return is_open, f"closed{_newtons(force)}{also}"
+        seen = f"{100 * press.least:.0f} % open{_newtons(press.force)}"
+        if press.least <= task.closed:
+            return False, f"closed{_newtons(press.force)} too shortly to be seen"
+        if press.most < task.enough:
+            return False, f"{seen}: not pressed enough"
+        begin, end = self._thrombus
+        is_thrombus = begin - task.tolerance <= point.at <= end + task.tolerance
+        return is_thrombus, f"{seen}: {'a thrombus' if is_thrombus else 'not closed'}"
+
+    def _tell_press(self) -> str:
+        """Return what is to be known of the press that goes on."""
+        press = self._press
+        assert press is not None
+        if press.problem:
+            return press.problem
+        if press.closed is not None:
+            return f"closed{_newtons(press.closed[0])}: let go"
+        seen = f"{100 * press.least:.0f} % open{_newtons(press.force)}"
+        return f"{seen}: {'press harder' if press.most < self._task.enough else 'let go'}"
+
+
+def _newtons(force: float) -> str:
+    return f" at {force:.1f} N" if np.isfinite(force) else ""
