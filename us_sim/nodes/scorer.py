@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import json
 from array import array
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from datetime import datetime
+from importlib.metadata import version
 from io import BytesIO
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rcl_interfaces.msg import ParameterEvent
+from rclpy.parameter import parameter_value_to_python
 from sensor_msgs.msg import CompressedImage, Image
 
+from us_sim.errors import ScoreError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import node_main
@@ -20,36 +27,47 @@ from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import ScorerSettings
 from us_sim.recording.decoding import nanoseconds_of, pixels_from, pose_from, wrench_from
 from us_sim.scene.building import scanner_of, volume_of
-from us_sim.scoring.exercise import Step, read_exercise
-from us_sim.scoring.live import LiveScan
+from us_sim.scoring.exercise import IN_AIR, Step, read_exercise
+from us_sim.scoring.live import LiveScan, Score
+from us_sim.scoring.metrics import Scan
 from us_sim.scoring.picture import draw_score
+from us_sim.scoring.result import plain_metrics, state_of, write_result
 from us_sim.scoring.settings import ScoreSettings
 
 _PERIOD = 200_000_000  # ns of the probe's poses, after which areas are measured again
 _REMEMBERED = 256  # poses, for the image with the same stamp
+_CHANGING = ("tissue_deformer", "skin_deformer", "slice_interpolator", "probe_tracker")
+"""Nodes whose parameters decide what a learner meets."""
 
 
 class Scorer(SceneNode):
     """``probe/pose``, ``probe/wrench`` and ``ultrasound/labels`` in, ``score`` once a second.
 
-    The first status has the metrics as values; one of each step follows, with what was seen of it
-    and where it is to be done. It is OK when it is done, and an ERROR when it was missed.
+    The first status has all metrics as values. The ``hardware_id`` of each that follows says what
+    it is: a ``step``, with what was seen of it and where it is to be done, OK when it is done and
+    an ERROR when it was missed; a ``fault``; ``plain``, the metrics that are read first, with what
+    became of the attempt; and ``about``, who did what with what.
     The service ``~/clear`` begins anew; ``~/draw`` has a picture made, on ``score/picture``, which
-    is also made once the last step is done.
+    is also made once the attempt has ended. Then its result is written, too.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("scorer", **kwargs)
-        name = declared(self, ScorerSettings()).exercise or self.scene.exercise
+        self._settings = declared(self, ScorerSettings())
+        name = self._settings.exercise or self.scene.exercise
         self._exercise = read_exercise(name) if name else None
         limits = declared(self, ScoreSettings())
+        if self._exercise is not None and hasattr(self._exercise.assigned, "force_limit"):
+            limits = replace(limits, force_limit=self._exercise.assigned.force_limit)
+        self._limits = limits
         volume = volume_of(self.scene)
         scanner = scanner_of(self.scene, volume, threads=self.threads)
         self._live = LiveScan(volume, scanner, self._exercise, limits)
         self._title = self._exercise.name if self._exercise is not None else self.scene.name
-        self._is_drawn = False  # since the last step was done
-        self._poses: dict[int, Pose] = {}
-        self._begin = self._measured = 0  # ns
+        self._void = ""
+        if self._settings.begun:
+            self._void = "the scorer was started again: begin anew"
+        self._begin_attempt()
         self._score = self.latched(DiagnosticArray, "score")
         self._picture = self.latched(CompressedImage, "score/picture")
         self._picture.publish(CompressedImage())  # what a page has may be of a node before
@@ -57,10 +75,24 @@ class Scorer(SceneNode):
         self.subscribe(WrenchStamped, "probe/wrench", self._on_wrench, EVERY)
         if self._live.lines:
             self.subscribe(Image, "ultrasound/labels", self._on_labels, newest=True)
+        self.subscribe(ParameterEvent, "/parameter_events", self._on_parameters, EVERY)
         self.offer("clear", self._clear)
         self.offer("draw", self._draw)
         self.create_timer(1.0, self._tell)
         self.health.state = "following"
+
+    def destroy_node(self) -> None:
+        """Write the result of an attempt that has not ended, too."""
+        self._keep_result(self._live.score(), is_last=True)
+        super().destroy_node()
+
+    def _begin_attempt(self) -> None:
+        self._is_kept = False  # its picture is drawn and its result written
+        self._poses: dict[int, Pose] = {}
+        self._begin = self._measured = 0  # ns
+        self._changes: list[str] = []
+        self._begun = datetime.now().astimezone().isoformat(timespec="seconds")
+        self.health.values = {}
 
     def _on_pose(self, message: PoseStamped) -> None:
         stamp, pose = nanoseconds_of(message.header.stamp), pose_from(message, "patient")
@@ -72,8 +104,10 @@ class Scorer(SceneNode):
 
     def _on_wrench(self, message: WrenchStamped) -> None:
         if self._begin:
-            time = self._seconds(nanoseconds_of(message.header.stamp))
-            self._live.add_force(time, wrench_from(message)[:3])
+            time, force = self._seconds(nanoseconds_of(message.header.stamp)), wrench_from(message)
+            self._live.add_force(time, force[:3])
+            if "begun" not in self.health.values and np.linalg.norm(force[:3]) >= IN_AIR:
+                self.health.values["begun"] = f"{1e-9 * self._begin:.3f}"  # by now it is lost
 
     def _on_labels(self, message: Image) -> None:
         stamp = nanoseconds_of(message.header.stamp)
@@ -85,68 +119,149 @@ class Scorer(SceneNode):
     def _seconds(self, stamp: int) -> float:
         return 1e-9 * (stamp - self._begin)
 
+    def _on_parameters(self, message: ParameterEvent) -> None:
+        """Note what a person changes of the simulation meanwhile, such as the method."""
+        space = self.get_namespace().rstrip("/")
+        node = message.node.removeprefix(f"{space}/")
+        if node not in _CHANGING:
+            return
+        for changed in message.changed_parameters:
+            value = parameter_value_to_python(changed.value)
+            when = f"{self._seconds(nanoseconds_of(message.stamp)):.0f} s" if self._begin else "0 s"
+            self._changes.append(f"{node}.{changed.name} = {value} at {when}")
+
     def _tell(self) -> None:
-        if not self._score.get_subscription_count():
+        is_heard = self._score.get_subscription_count() > 0
+        if not is_heard and not self._settings.results:
             return
         score = self._live.score()
         if score is None:
             return
-        metrics, steps = score
+        if is_heard:
+            self._score.publish(self._message(score))
+            self.health.published("score")
+        self._keep_result(score)
+
+    def _message(self, score: Score) -> DiagnosticArray:
         told = DiagnosticStatus(
             level=DiagnosticStatus.OK,
             name=self._title,
             message=self._exercise.description if self._exercise is not None else "",
             hardware_id=self.scene.name,
-            values=[KeyValue(key=each.label, value=each.text) for each in metrics],
+            values=[KeyValue(key=each.label, value=each.text) for each in score.metrics],
         )
-        message = DiagnosticArray(status=[told, *map(_status_of, steps)])
+        result = self._result(score)
+        message = DiagnosticArray(status=[told, *map(_step_status, score.steps)])
+        for fault in result["faults"]:
+            values = {"seconds": f"{fault['seconds']:.1f}"}
+            message.status.append(_status("fault", fault["what"], values, DiagnosticStatus.WARN))
+        message.status.append(_status("plain", result["state"], result["plain"]))
+        message.status.append(_status("about", "", result["about"]))
         message.header.stamp = self.get_clock().now().to_msg()
-        self._score.publish(message)
-        self.health.published("score")
-        is_passed = bool(steps) and all(step.is_done for step in steps)
-        if is_passed and not self._is_drawn and self._picture.get_subscription_count():
-            self._is_drawn = self._publish_picture(steps)
+        return message
 
-    def _publish_picture(self, steps: Sequence[Step]) -> bool:
-        """Publish a picture of the scan; whether there is one."""
+    def _result(self, score: Score) -> dict[str, Any]:
+        """Return the document of `us_sim.scoring.result`."""
+        exercise, volume = self._exercise, self.scene.volume
+        about = {
+            "student": self._settings.student,
+            "begun": self._begun,
+            "exercise": exercise.origin if exercise is not None else "",
+            "checksum": exercise.checksum if exercise is not None else "",
+            "scene": self.scene.name,
+            "volume": volume.name,
+            "method": self.scene.tissue.solver if self.scene.tissue else "none",
+            "changed": "; ".join(self._changes),
+            "us_sim": version("us_sim"),
+        }
+        faults = [{"seconds": each.time, "what": each.what} for each in score.faults]
+        if self._void:
+            faults.insert(0, {"seconds": 0.0, "what": self._void})
+        return {
+            "name": self._title,
+            "description": exercise.description if exercise is not None else "",
+            "scene": self.scene.name,
+            "state": state_of(score, self._void),
+            "seconds": score.seconds,
+            "about": about,
+            "plain": {
+                each.label: each.brief for each in plain_metrics(score, self._limits.force_limit)
+            },
+            "steps": [_step_document(step) for step in score.steps],
+            "faults": faults,
+            "metrics": {each.label: each.text for each in score.metrics},
+        }
+
+    def _keep_result(self, score: Score | None, *, is_last: bool = False) -> None:
+        """Draw and write the result once the attempt has ended, or shall go on no more."""
+        is_due = score is not None and (score.has_ended or (is_last and score.seconds is not None))
+        if score is None or not is_due or self._is_kept or self._exercise is None:
+            return
+        self._is_kept = True
         scan = self._live.scan()
-        if scan is None:
-            return False
+        picture = self._drawn(scan, score.steps) if scan is not None else b""
+        if not is_last:
+            self._publish_picture(picture)
+        if self._settings.results:
+            result = self._result(score)
+            result["state"] = "not passed" if result["state"] == "running" else result["state"]
+            try:
+                files = write_result(result, picture, self._settings.results)
+            except ScoreError as error:
+                self.health.problem("results", str(error))
+            else:
+                self.get_logger().info(f"the result is in {files[0]}")
+
+    def _drawn(self, scan: Scan, steps: Sequence[Step]) -> bytes:
         drawn = BytesIO()
         draw_score(drawn, self._title, scan, steps)
-        message = CompressedImage(format="png", data=array("B", drawn.getvalue()))
+        return drawn.getvalue()
+
+    def _publish_picture(self, picture: bytes) -> None:
+        message = CompressedImage(format="png", data=array("B", picture))
         message.header.stamp = self.get_clock().now().to_msg()
         self._picture.publish(message)
         self.health.published("score/picture")
-        return True
 
     def _draw(self) -> str:
-        score = self._live.score()
-        is_drawn = score is not None and self._publish_picture(score[1])
-        return "" if is_drawn else "nothing was done yet"
+        score, scan = self._live.score(), self._live.scan()
+        if score is None or scan is None:
+            return "nothing was done yet"
+        self._publish_picture(self._drawn(scan, score.steps))
+        return ""
 
     def _clear(self) -> str:
+        self._keep_result(self._live.score(), is_last=True)
         self._live.clear()
-        self._poses, self._begin, self._measured = {}, 0, 0
-        self._is_drawn = False
+        self._void = ""
+        self._begin_attempt()
         self._picture.publish(CompressedImage())  # what was drawn is of before
         return ""
 
 
-def _status_of(step: Step) -> DiagnosticStatus:
-    level = DiagnosticStatus.ERROR if step.is_missed else DiagnosticStatus.WARN
-    values = []
+def _status(
+    kind: str, message: str, values: Mapping[str, Any], level: bytes = DiagnosticStatus.OK
+) -> DiagnosticStatus:
+    told = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+    return DiagnosticStatus(level=level, name=kind, message=message, hardware_id=kind, values=told)
+
+
+def _step_document(step: Step) -> dict[str, Any]:
+    state = "done" if step.is_done else "missed" if step.is_missed else "to do"
+    return {"what": step.what, "state": state, "seen": step.seen}
+
+
+def _step_status(step: Step) -> DiagnosticStatus:
+    values = {}
     if step.target is not None:
-        values.append(KeyValue(key="target", value=json.dumps(step.target.round(4).tolist())))
+        values["target"] = json.dumps(step.target.round(4).tolist())
     if step.pose is not None:
         pose = [*step.pose.position.tolist(), *step.pose.orientation.tolist()]
-        values.append(KeyValue(key="pose", value=json.dumps(pose)))
-    return DiagnosticStatus(
-        level=DiagnosticStatus.OK if step.is_done else level,
-        name=step.what,
-        message=step.seen,
-        values=values,
-    )
+        values["pose"] = json.dumps(pose)
+    level = DiagnosticStatus.ERROR if step.is_missed else DiagnosticStatus.WARN
+    status = _status("step", step.seen, values, DiagnosticStatus.OK if step.is_done else level)
+    status.name = step.what
+    return status
 
 
 main = node_main(Scorer, __name__)

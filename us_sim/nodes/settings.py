@@ -404,6 +404,16 @@ class ScorerSettings(Settings):
         description="file of an exercise, or name of an installed one, in place of the scene's",
         default=None,
     )
+    student: str = setting(description="name that results bear", default="")
+    results: str | None = setting(
+        description="folder, or address of fsspec, to which each result is written",
+        default=None,
+    )
+    begun: float = setting(
+        Quantity("time", 0.0, 1e10),
+        "since 1970, when an attempt began that a killed scorer forgot: this one is void; 0: none",
+        default=0.0,
+    )
 
 
 NODES: dict[str, tuple[type[Settings], ...]] = {

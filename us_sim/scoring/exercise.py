@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -110,6 +111,7 @@ class TimedAttempt(Attempt):
             new_times = times[times > scan.since]
             self._touched = float(new_times[0]) if len(new_times) else None
         self._attempt.add(scan)
+        self.ended = self._attempt.ended
 
     def steps(self) -> list[Step]:
         """Return every thing that is to be done."""
@@ -123,8 +125,7 @@ class TimedAttempt(Attempt):
         """Return the time from the first touch to the end, or so far; None before the first."""
         if self._touched is None:
             return None
-        ended = self._attempt.ended
-        return (self._time if ended is None else ended) - self._touched
+        return (self._time if self.ended is None else self.ended) - self._touched
 
 
 class Task(Settings):
@@ -371,6 +372,8 @@ class Exercise(Settings):
     task: Chosen = setting(choice=EXERCISES)
     description: str = setting(description="of what is to be done, for the learner", default="")
     scene: str | None = setting(description="scene that it is made for", default=None)
+    origin: str = ""  # its file
+    checksum: str = ""  # of that file: the first 12 digits of its SHA-256
 
     @property
     def assigned(self) -> Any:
@@ -413,7 +416,9 @@ def read_exercise(name: str | Path) -> Exercise:
         if str(name) not in known:
             raise ScoreError(f"exercise {unknown(str(name), sorted(known))}")
         path = known[str(name)]
-    return Reader(str(path), None, ScoreError).read(Exercise, read_yaml(path, ScoreError))
+    exercise = Reader(str(path), None, ScoreError).read(Exercise, read_yaml(path, ScoreError))
+    checksum = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    return replace(exercise, origin=str(path.resolve()), checksum=checksum)
 
 
 def result_of(done: Sequence[bool]) -> str:

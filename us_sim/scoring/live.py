@@ -34,6 +34,7 @@ class Score(NamedTuple):
     steps: Sequence[Step] = ()
     faults: Sequence[Fault] = ()
     seconds: float | None = None  # from the first touch to the end, or so far; None before
+    has_ended: bool = False  # all was done, or the time is over
 
 
 class LiveScan:
@@ -130,7 +131,8 @@ class LiveScan:
         metrics = list(tally.metrics())
         if attempt is None:
             return Score(metrics)
-        return Score(metrics, attempt.steps(), attempt.faults(), attempt.seconds())
+        steps, faults = attempt.steps(), attempt.faults()
+        return Score(metrics, steps, faults, attempt.seconds(), attempt.ended is not None)
 
     def _settle(self) -> None:
         """Add what later samples cannot change any more."""

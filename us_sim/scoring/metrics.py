@@ -23,6 +23,23 @@ _Array = NDArray[np.float64]
 _MM, _MM2, _DEGREES = 1e3, 1e6, float(np.rad2deg(1.0))
 
 
+DEFINITIONS = {
+    "Elapsed Time": "from the first pose to the last",
+    "Path Length": "sum of the steps between poses",
+    "Rotation Total": "sum of the shorter turns between poses",
+    "Translational Actions": "times that the probe's face moved faster than 50 mm/s",
+    "Rotational Actions": "times that the probe turned faster than 50 °/s",
+    "Motion Smoothness": "root of the integral of the squared jerk; less is smoother",
+    "Dimensionless Squared Jerk": "integral of the squared jerk × time⁵ / path length²",
+    "Time in Contact": "while the force is at least that of contact",
+    "Force Impulse": "integral of the force over time",
+    "Area Scanned in Contact": "area of the skin over which the face slid while in contact",
+    "Smallest Part of the Area at Rest": "of the vessel in the same plane without pressure",
+    "Mean Angle to the Vessel": "between its centre line and the image; 90° is straight across",
+}
+"""Of metrics whose name does not say all, by their names."""
+
+
 @dataclass(frozen=True)
 class Metric:
     """One value of a table."""
@@ -44,10 +61,18 @@ class Metric:
 
     @property
     def text(self) -> str:
-        """The value as a person reads it; - where it is not known."""
+        """The value as a program reads it; - where it is not known."""
+        return self._written(6)
+
+    @property
+    def brief(self) -> str:
+        """The value as a person reads it, in three digits."""
+        return self._written(3)
+
+    def _written(self, digits: int) -> str:
         if not np.isfinite(self.value):
             return "-"
-        return f"{self.value:.0f}" if self.unit == "count" else f"{self.value:.6g}"
+        return f"{self.value:.0f}" if self.unit == "count" else f"{self.value:.{digits}g}"
 
 
 @dataclass(frozen=True)
