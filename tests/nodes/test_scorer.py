@@ -7,6 +7,7 @@ import pytest
 from bench import pose_at
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import Trigger
 
@@ -128,3 +129,59 @@ def test_a_step_says_where_it_is_to_be_done(bench, small_scene):
     assert {each.key: json.loads(each.value) for each in step.values} == {
         "pose": [-0.002, 0.02, 0, 0, 0, 0, 1]
     }
+
+
+def statuses(score, kind):
+    return [each for each in score.status if each.hardware_id == kind]
+
+
+def test_the_result_is_written_when_the_attempt_has_ended(bench, small_scene, tmp_path):
+    file = tmp_path / "hold.yaml"
+    file.write_text(KEEP)
+    out = tmp_path / "class"
+    bench.make(
+        Scorer, scene=str(small_scene), exercise=str(file), student="A. B.", results=str(out)
+    )
+    press(bench, 5.0)
+    bench.spin_until(lambda: len(list(out.glob("*.json"))) == 1)
+    result = json.loads(next(out.glob("*.json")).read_text())
+    assert (result["state"], result["about"]["student"]) == ("passed", "A. B.")
+    assert len(result["about"]["checksum"]) == 12
+    assert list(result["plain"].values()) == ["8", "5", "0", "110", "1"]
+    page = next(out.glob("*.html")).read_text()
+    assert "passed" in page
+    assert "data:image/png" in page
+
+
+def press(bench, newtons, seconds=12):
+    """Publish poses and forces, the first of them in the air."""
+    poses = bench.publisher(PoseStamped, "probe/pose")
+    wrenches = bench.publisher(WrenchStamped, "probe/wrench")
+    for second in range(seconds):
+        pose = pose_at(0.0, second + 1, x=0.01 * (second % 2))
+        poses.publish(pose)
+        force = np.array([0.0, 0.0, -newtons if second else 0.0])
+        wrenches.publish(wrench_message(force, np.zeros(3), pose.header.stamp, "probe"))
+
+
+def test_an_attempt_that_a_killed_scorer_forgot_is_void_until_it_is_begun_anew(
+    bench, small_scene, tmp_path
+):
+    (tmp_path / "hold.yaml").write_text(KEEP)
+    given = {"scene": str(small_scene), "exercise": str(tmp_path / "hold.yaml")}
+    bench.make(Scorer, **given, begun=12.5)
+    scores = bench.collect(DiagnosticArray, "score", latched=True)
+    press(bench, 5.0)
+    bench.spin_until(lambda: bool(scores))
+    assert statuses(scores[-1], "plain")[0].message == "void"
+    assert "begin anew" in statuses(scores[-1], "fault")[0].message
+    assert ask(bench, "clear")
+    press(bench, 5.0)
+    bench.spin_until(lambda: statuses(scores[-1], "plain")[0].message != "void")
+    assert not statuses(scores[-1], "fault")
+
+
+def test_answers_are_refused_where_an_exercise_asks_nothing(node):
+    refused = node.set_parameters([Parameter("answers", value=["compressible"])])[0]
+    assert not refused.successful
+    assert "asks nothing" in refused.reason

@@ -14,7 +14,7 @@ from us_sim.scoring.motion import Motion
 POINTS = (0.01, 0.03, 0.05)  # m along a vein of 6 cm, of which 8 mm are left out at both ends
 LINE = CentreLine(np.linspace([0.002, -0.03, 0.013], [0.002, 0.03, 0.013], 61))
 CLOSES = 8.0  # N
-CLOT = (0.028, 0.034)  # m along the vein
+CLOT = (0.024, 0.036)  # m along the vein
 
 
 def scanned(keys, clot=None, *, beside=False, artery=1.0, rate=5.0):
@@ -235,3 +235,70 @@ def until(seen, end):
         force=Force(seen.force.times[kept], seen.force.newtons[kept]),
         sections={name: cut(section) for name, section in seen.sections.items()},
     )
+
+
+def blind(seen, points=("compressible",) * 3, thrombus="none", **task):
+    exercise = replace(read_exercise("compression"), feedback="afterwards")
+    changed = replace(exercise.assigned, **task)
+    made = replace(exercise, task=replace(exercise.task, given=changed)).begin(seen.lines)
+    made.add(seen)
+    hidden = made.steps()
+    made.answer(points, thrombus)
+    return hidden, made
+
+
+CLOT_THERE = ("compressible", "not compressible", "compressible")
+
+
+def test_a_blind_examination_tells_nothing_until_all_is_answered():
+    seen = scanned(examination(newtons=(9.0, 12.0, 9.0)), clot=CLOT)
+    hidden, made = blind(seen, CLOT_THERE, "2")
+    told = " ".join(f"{step.what} {step.seen}" for step in hidden)
+    assert not any(word in told for word in ("thrombus:", "open", "closed", "vein", "%"))
+    assert not any(step.is_done for step in hidden)
+    assert made.ended is not None
+    assert [step.is_done for step in made.steps()] == [True] * 4
+
+
+@pytest.mark.parametrize(
+    ("points", "thrombus", "right"),
+    [
+        (("compressible",) * 3, "none", [True, False, True, False]),
+        (CLOT_THERE, "1", [True, True, True, False]),
+        (("not seen",) * 3, "2", [False, False, False, True]),
+    ],
+)
+def test_wrong_answers_are_held_against_the_truth(points, thrombus, right):
+    seen = scanned(examination(newtons=(9.0, 12.0, 9.0)), clot=CLOT)
+    assert [step.is_done for step in blind(seen, points, thrombus)[1].steps()] == right
+
+
+def test_right_answers_without_an_examination_do_not_pass():
+    seen = scanned(bad("without scanning"))
+    made = blind(seen)[1]
+    assert [step.is_done for step in made.steps()] == [False, False, False, True]
+    assert "not examined" in made.steps()[0].seen
+
+
+def test_an_answer_ends_a_blind_attempt_only_when_all_are_there():
+    _, made = blind(scanned(examination()), ("compressible", "", "compressible"))
+    assert made.ended is None
+    made.answer(("compressible",) * 3, "none")
+    assert [step.is_done for step in made.steps()] == [True] * 4
+    with pytest.raises(ScoreError, match="ended"):
+        made.answer(("compressible",) * 3, "1")
+
+
+@pytest.mark.parametrize(
+    ("points", "thrombus"), [(("maybe",), ""), (("",) * 4, ""), (("",), "4"), (("",), "some")]
+)
+def test_an_answer_that_is_none_is_refused(points, thrombus):
+    with pytest.raises(ScoreError):
+        blind(scanned(examination()), points, thrombus)
+
+
+def test_where_all_is_said_at_once_nothing_is_asked():
+    with pytest.raises(ScoreError, match="asks nothing"):
+        attempt(scanned(examination())).answer(("compressible",), "")
+    with pytest.raises(ScoreError, match="compression"):
+        replace(read_exercise("keep_force"), feedback="afterwards").begin({})

@@ -20,7 +20,7 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from us_sim.errors import ScoreError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.parameters import declared
+from us_sim.nodes.parameters import LiveSettings, declared
 from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import EVERY
 from us_sim.nodes.scene_node import SceneNode
@@ -35,6 +35,7 @@ from us_sim.scoring.result import plain_metrics, state_of, write_result
 from us_sim.scoring.settings import ScoreSettings
 
 _PERIOD = 200_000_000  # ns of the probe's poses, after which areas are measured again
+OWN = "scorer"
 _REMEMBERED = 256  # poses, for the image with the same stamp
 _CHANGING = ("tissue_deformer", "skin_deformer", "slice_interpolator", "probe_tracker")
 """Nodes whose parameters decide what a learner meets."""
@@ -53,7 +54,8 @@ class Scorer(SceneNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("scorer", **kwargs)
-        self._settings = declared(self, ScorerSettings())
+        live = LiveSettings(self, {OWN: ScorerSettings()}, check=self._check_answers)
+        self._live_settings, self._settings = live, live.values[OWN]
         name = self._settings.exercise or self.scene.exercise
         self._exercise = read_exercise(name) if name else None
         limits = declared(self, ScoreSettings())
@@ -119,6 +121,11 @@ class Scorer(SceneNode):
     def _seconds(self, stamp: int) -> float:
         return 1e-9 * (stamp - self._begin)
 
+    def _check_answers(self, values: Mapping[str, Any]) -> None:
+        own: ScorerSettings = values[OWN]
+        if any(own.answers) or own.thrombus:
+            self._live.answer(own.answers, own.thrombus)
+
     def _on_parameters(self, message: ParameterEvent) -> None:
         """Note what a person changes of the simulation meanwhile, such as the method."""
         space = self.get_namespace().rstrip("/")
@@ -168,6 +175,7 @@ class Scorer(SceneNode):
             "begun": self._begun,
             "exercise": exercise.origin if exercise is not None else "",
             "checksum": exercise.checksum if exercise is not None else "",
+            "feedback": exercise.feedback if exercise is not None else "live",
             "scene": self.scene.name,
             "volume": volume.name,
             "method": self.scene.tissue.solver if self.scene.tissue else "none",
@@ -233,6 +241,7 @@ class Scorer(SceneNode):
     def _clear(self) -> str:
         self._keep_result(self._live.score(), is_last=True)
         self._live.clear()
+        self._live_settings.restore({OWN: replace(self._settings, answers=("",), thrombus="")})
         self._void = ""
         self._begin_attempt()
         self._picture.publish(CompressedImage())  # what was drawn is of before

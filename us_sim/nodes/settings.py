@@ -409,6 +409,18 @@ class ScorerSettings(Settings):
         description="folder, or address of fsspec, to which each result is written",
         default=None,
     )
+    answers: tuple[str, ...] = setting(
+        description="of the learner, where an exercise asks, for each point: compressible, not "
+        "compressible, not seen; empty for none yet",
+        default=("",),
+        live=True,
+    )
+    thrombus: str = setting(
+        description="likewise, where it is: the number of a point at it, or none; empty for no "
+        "answer yet",
+        default="",
+        live=True,
+    )
     begun: float = setting(
         Quantity("time", 0.0, 1e10),
         "since 1970, when an attempt began that a killed scorer forgot: this one is void; 0: none",

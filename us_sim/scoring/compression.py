@@ -6,7 +6,7 @@ and was let go. A thrombus keeps a vein from closing: there it is enough to have
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -15,7 +15,17 @@ from numpy.typing import NDArray
 
 from us_sim.errors import ScoreError
 from us_sim.scoring.centre_line import CentreLine
-from us_sim.scoring.exercise import IN_AIR, LENGTH, PART, Attempt, Fault, Step, Task
+from us_sim.scoring.exercise import (
+    ANSWERS,
+    IN_AIR,
+    LENGTH,
+    NO_THROMBUS,
+    PART,
+    Attempt,
+    Fault,
+    Step,
+    Task,
+)
 from us_sim.scoring.metrics import Scan
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
@@ -24,6 +34,7 @@ from us_sim.slicing.settings import WALLS_TOUCH
 _FORCE = Quantity("force", 0.1, 200.0)
 _LOOKED = 0.3  # s, for which a person must see a vein open, or closed, to be sure of it
 _LIGHT = 3.0  # N, below which a probe lies on the skin and does not press
+_EDGE = 3e-3  # m from a thrombus' end, within which nobody can tell
 _MM = 1e3
 
 
@@ -131,6 +142,9 @@ class _Point:
     is_done: bool = False
     seen: str = "not reached"
     is_tried: bool = False
+    is_examined: bool = False  # by a press that counts, whatever it showed
+    most: float | None = None  # N, of the last press
+    answer: str = ""  # of `ANSWERS`
 
 
 @dataclass
@@ -180,6 +194,35 @@ class _Examination(Attempt):
         self._begin: float | None = None  # s, of the first touch
         self._thrombus = np.inf, -np.inf  # m, from and to
         self._faults: list[Fault] = []
+        self._is_hidden = False  # the truth
+        self._answer = ""  # where the thrombus is: a point's number, or that there is none
+
+    def hide_truth(self) -> None:
+        """Have steps say nothing that an image does not show, until the attempt has ended."""
+        self._is_hidden = True
+
+    def answer(self, points: Sequence[str], thrombus: str) -> None:
+        """Take the learner's answers; the last one ends the attempt.
+
+        Raises:
+            ScoreError: nothing is asked, it has ended, or an answer will not do.
+        """
+        numbers = [str(k + 1) for k in range(len(self._points))]
+        if not self._is_hidden:
+            raise ScoreError("answers: this exercise says at once what is right, and asks nothing")
+        if self.ended is not None:
+            raise ScoreError("answers: the attempt has ended: begin anew")
+        if len(points) > len(numbers) or not {*points} <= {*ANSWERS, ""}:
+            raise ScoreError(
+                f"answers: one of {', '.join(ANSWERS)} for each of {len(numbers)} points"
+            )
+        if thrombus not in ("", NO_THROMBUS, *numbers):
+            raise ScoreError(f"thrombus: {NO_THROMBUS}, or a point's number, 1 to {len(numbers)}")
+        for point, answer in zip(self._points, points, strict=False):
+            point.answer = answer
+        self._answer = thrombus
+        if thrombus and all(point.answer for point in self._points):
+            self.ended = max(self._time, self._begin or 0.0)
 
     def add(self, scan: Scan) -> None:
         """Take the images that are new."""
@@ -215,18 +258,50 @@ class _Examination(Attempt):
         pressed = self._pressed()
         steps = []
         for number, point in enumerate(self._points, 1):
+            what = f"{number}: {self._task.structure} at {_MM * point.at:.0f} mm"
+            if self._is_hidden:
+                steps.append(self._hidden_step(f"point {number}", point))
+                continue
             seen = self._tell_press() if point is pressed and not point.is_done else point.seen
             is_here = abs(self._along - point.at) <= self._task.tolerance
-            steps.append(
-                Step(
-                    f"{number}: {self._task.structure} at {_MM * point.at:.0f} mm",
-                    point.is_done,
-                    seen,
-                    point.place[None],
-                    is_missed=point.is_tried and not point.is_done and not is_here,
-                )
-            )
+            is_missed = point.is_tried and not point.is_done and not is_here
+            steps.append(Step(what, point.is_done, seen, point.place[None], is_missed=is_missed))
+        if self._is_hidden:
+            steps.append(self._thrombus_step())
         return [*steps, *self._steps_of_time()]
+
+    def _hidden_step(self, what: str, point: _Point) -> Step:
+        """Return the step of a point on which the learner answers."""
+        pressed = "not pressed" if point.most is None else f"pressed with {point.most:.1f} N"
+        seen = f"{pressed}, {point.answer or 'no answer yet'}"
+        if self.ended is None:
+            return Step(what, False, seen, point.place[None])
+        truths = self._truths(point)
+        is_right = point.answer in truths and point.is_examined
+        if point.answer not in truths:
+            seen = f"{seen}: it is {truths[0]}"
+        elif not is_right:
+            seen = f"{seen}: right, and not examined: {point.seen}"
+        return Step(what, is_right, seen, point.place[None], is_missed=not is_right)
+
+    def _thrombus_step(self) -> Step:
+        seen = f"at point {self._answer}" if self._answer.isdigit() else self._answer
+        if self.ended is None:
+            return Step("thrombus", False, seen or "no answer yet")
+        truths = enumerate(map(self._truths, self._points), 1)
+        where = [str(number) for number, each in truths if ANSWERS[1] in each]
+        is_right = self._answer in (where or [NO_THROMBUS])
+        if not is_right:
+            seen = f"{seen}: {f'it is at point {where[0]}' if where else 'there is none'}"
+        return Step("thrombus", is_right, seen, is_missed=not is_right)
+
+    def _truths(self, point: _Point) -> tuple[str, ...]:
+        """Return the right answers on a point: both within 3 mm of a thrombus' end."""
+        (begin, end), (compressible, not_compressible, _) = self._thrombus, ANSWERS
+        inside = min(point.at - begin, end - point.at)
+        if abs(inside) <= _EDGE:
+            return not_compressible, compressible
+        return (not_compressible,) if inside > 0 else (compressible,)
 
     def faults(self) -> list[Fault]:
         """Return what was done wrong."""
@@ -263,7 +338,7 @@ class _Examination(Attempt):
         if self._press is not None and not presses:
             self._finish(self._press)
         self._see_open(look)
-        if all(point.is_done for point in self._points):
+        if not self._is_hidden and all(point.is_done for point in self._points):
             self.ended = look.time
 
     def _see_open(self, look: _Look) -> None:
@@ -318,7 +393,9 @@ class _Examination(Attempt):
         self._press, self._was_lifted = None, False
         if point is None or point.is_done:
             return
-        point.is_tried = True
+        point.is_tried, point.most = True, press.most
+        is_seen = press.closed is not None or press.most >= self._task.enough
+        point.is_examined |= is_seen and not press.problem
         point.is_done, point.seen = self._judge(press, point)
 
     def _judge(self, press: _Press, point: _Point) -> tuple[bool, str]:

@@ -34,6 +34,9 @@ from us_sim.share import shared_roots
 
 LENGTH, PART = Quantity("length", 1e-4, 1.0), Quantity("number", 0.0, 1.0)
 _TIME, _FORCE = Quantity("time", 0.1, 3600.0), "force"
+ANSWERS = ("compressible", "not compressible", "not seen")
+"""Of a learner, on a point of a vein."""
+NO_THROMBUS = "none"
 IN_AIR = 0.1
 """N, below which the probe touches nothing."""
 _MM = 1e3
@@ -75,6 +78,26 @@ class Attempt(ABC):
     def faults(self) -> list[Fault]:
         """Return what was done wrong, in order."""
         return []
+
+    def hide_truth(self) -> None:
+        """Have steps say nothing that an image does not show, until the attempt has ended.
+
+        Raises:
+            ScoreError: the task has no questions that could be answered then.
+        """
+        raise ScoreError("feedback: afterwards: is for a compression, which has questions")
+
+    def answer(self, points: Sequence[str], thrombus: str) -> None:  # noqa: ARG002
+        """Take the learner's answers so far.
+
+        Args:
+            points: one for each point, of `ANSWERS`; "" for none yet.
+            thrombus: number of a point at it, "none", or "" for no answer yet.
+
+        Raises:
+            ScoreError: nothing is asked, or an answer will not do.
+        """
+        raise ScoreError("answers: this exercise asks nothing")
 
 
 class TimedAttempt(Attempt):
@@ -120,6 +143,15 @@ class TimedAttempt(Attempt):
     def faults(self) -> list[Fault]:
         """Return what was done wrong, in order."""
         return self._attempt.faults()
+
+    def hide_truth(self) -> None:
+        """Have steps say nothing that an image does not show, until the attempt has ended."""
+        self._attempt.hide_truth()
+
+    def answer(self, points: Sequence[str], thrombus: str) -> None:
+        """Take the learner's answers so far."""
+        self._attempt.answer(points, thrombus)
+        self.ended = self._attempt.ended
 
     def seconds(self) -> float | None:
         """Return the time from the first touch to the end, or so far; None before the first."""
@@ -372,6 +404,18 @@ class Exercise(Settings):
     task: Chosen = setting(choice=EXERCISES)
     description: str = setting(description="of what is to be done, for the learner", default="")
     scene: str | None = setting(description="scene that it is made for", default=None)
+    minutes: int = setting(Quantity("number", 1, 240), "that it takes about", default=5)
+    feedback: str = setting(
+        description="live: what is right is said at once; afterwards: the page shows what a "
+        "scanner shows, the learner answers, and the result compares with the truth",
+        choices=("live", "afterwards"),
+        default="live",
+    )
+    seeds: tuple[int, int] | None = setting(
+        Quantity("number", 0, 2**31),
+        "lowest and highest seed of the scene's phantom, one of which is drawn each time",
+        default=None,
+    )
     origin: str = ""  # its file
     checksum: str = ""  # of that file: the first 12 digits of its SHA-256
 
@@ -391,7 +435,10 @@ class Exercise(Settings):
                 known = unknown(name, lines) if lines else f"{name!r} is not known"
                 of = "the vessels of the scene" if lines else "a scan without a scene"
                 raise ScoreError(f"exercise {self.name}: in {of} the structure {known}")
-        return TimedAttempt(self.assigned.begin(lines))
+        attempt = TimedAttempt(self.assigned.begin(lines))
+        if self.feedback == "afterwards":
+            attempt.hide_truth()
+        return attempt
 
     def steps(self, scan: Scan) -> list[Step]:
         """Steps to be done, with what was seen of each in a whole scan.

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.errors import ScoreError
 from us_sim.geometry.pose import Pose
 from us_sim.scoring.exercise import Attempt, Exercise, Fault, Step
 from us_sim.scoring.lumen import LumenMeter, lumens_of, vessels_in
@@ -89,6 +90,16 @@ class LiveScan:
         """Take the labels (rows, columns) of an image, likewise."""
         if self._lumens and self._is_next(self._meter.times, time):
             self._meter.add(time, pose, labels)
+
+    def answer(self, points: Sequence[str], thrombus: str) -> None:
+        """Take the learner's answers so far, see `Attempt.answer`.
+
+        Raises:
+            ScoreError: nothing is asked, or an answer will not do.
+        """
+        if self._attempt is None:
+            raise ScoreError("answers: no exercise is followed")
+        self._attempt.answer(points, thrombus)
 
     def _is_next(self, times: list[float], time: float) -> bool:
         return time > self._settled and not (times and time <= times[-1])

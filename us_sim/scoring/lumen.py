@@ -62,8 +62,9 @@ def vessels_in(volume: Volume) -> tuple[dict[str, CentreLine], dict[str, tuple[f
         if line is None:
             continue
         lines[name] = line
-        if len(numbers) > 1:
-            along = line.along(places_of(volume, np.isin(volume.labels, numbers[1])))
+        clot = np.isin(volume.labels, numbers[1:])
+        if clot.any():
+            along = line.along(places_of(volume, clot))
             thrombi[name] = float(along.min()), float(along.max())
     return lines, thrombi
 

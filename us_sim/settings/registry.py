@@ -40,6 +40,7 @@ PHANTOMS = Choice(
     error=VolumeError,
     upper_arm=f"{_PHANTOMS}:upper_arm",
     thrombosed_arm=f"{_PHANTOMS}:thrombosed_arm",
+    drawn_arm=f"{_PHANTOMS}:drawn_arm",
 )
 
 PROBES = Choice(

@@ -35,7 +35,7 @@ def upper_arm(
     voxel_size: float = 0.3e-3,
     progress: Progress | None = None,
     *,
-    thrombosed: bool = False,
+    thrombus: tuple[float, float] | None = None,
 ) -> Volume:
     """A labelled upper arm with the skin at z = 0: its echoes over 60 dB, without any loss.
 
@@ -46,7 +46,7 @@ def upper_arm(
         seed: not negative.
         voxel_size: m, 0.2 mm (1.1 GB while it is made) to 5 mm.
         progress: told the fraction done and the work in progress.
-        thrombosed: a thrombus fills a piece of the vein.
+        thrombus: from and to, m along y, where one fills the vein; one without a length is none.
 
     Raises:
         VolumeError: the seed or the voxel size is out of range.
@@ -78,7 +78,7 @@ def upper_arm(
     )
     inside = tuple(slice(m, m + n) for m, n in zip(margin, shape, strict=True))
 
-    arm = UpperArm(seed, thrombosed)
+    arm = UpperArm(seed, thrombus)
     labels = np.empty((len(x), len(y), len(z)), dtype=np.uint8)
     diffuse = np.empty(labels.shape, dtype=np.float32)
     specular = np.empty(labels.shape, dtype=np.float32)
@@ -107,7 +107,33 @@ def upper_arm(
     return volume
 
 
-thrombosed_arm = partial(upper_arm, thrombosed=True)
+thrombosed_arm = partial(upper_arm, thrombus=(-9e-3, 9e-3))
+
+
+def drawn_arm(
+    seed: int = 1, voxel_size: float = 0.3e-3, progress: Progress | None = None
+) -> Volume:
+    """Make an arm whose seed decides, too, whether a thrombus is in its vein, and where.
+
+    Args:
+        seed, voxel_size, progress: as for `upper_arm`.
+
+    Raises:
+        VolumeError: as `upper_arm`.
+    """
+    return upper_arm(seed, voxel_size, progress, thrombus=drawn_thrombus(seed))
+
+
+def drawn_thrombus(seed: int) -> tuple[float, float]:
+    """Draw where a thrombus begins and ends, m along y; in half of the arms there is none.
+
+    >>> drawn_thrombus(1) == drawn_thrombus(1)
+    True
+    """
+    random = np.random.Generator(np.random.PCG64([seed, 2]))
+    is_there, length = bool(random.integers(2)), random.uniform(12e-3, 20e-3)
+    begin = random.uniform(-22e-3, 22e-3 - length)
+    return (float(begin), float(begin + length)) if is_there else (0.0, 0.0)
 
 
 def cached_phantom(

@@ -245,7 +245,6 @@ _MARGIN = np.array([[-5e-3], [5e-3]])
 
 UPPER_ARM_LABELS = {"skin": 1, "fat": 2, "muscle": 3, "bone": 4, "artery": 5, "vein": 6, "nerve": 7}
 THROMBUS = {"vein thrombus": 8}
-_THROMBUS_ENDS = (-9e-3, 9e-3)  # m along y
 
 _SIDE_LOBES = -27.0  # dB
 _BLOOD = -60.0  # dB, all but free of echoes
@@ -287,11 +286,12 @@ class UpperArm:
     """An arm from a seed: it moves structures by half a millimetre and redraws every texture.
 
     Args:
-        thrombosed: a thrombus fills a piece of the vein.
+        thrombus: from and to, m along y, where one fills the vein; one without a length is none.
     """
 
-    def __init__(self, seed: int, thrombosed: bool = False) -> None:
-        self.labels = UPPER_ARM_LABELS | (THROMBUS if thrombosed else {})
+    def __init__(self, seed: int, thrombus: tuple[float, float] | None = None) -> None:
+        self.labels = UPPER_ARM_LABELS | ({} if thrombus is None else THROMBUS)
+        self._thrombus = thrombus or (0.0, 0.0)
         random = np.random.Generator(np.random.PCG64(seed))
 
         def tube(x: float, z: float, radius_x: float, radius_z: float, swing: float) -> Tube:
@@ -390,7 +390,7 @@ class UpperArm:
         np.maximum(section.diffuse, sheath, out=section.diffuse)
         for label, distance in zip(("artery", "vein"), walls, strict=False):
             section.fill(label, distance < 0.0, np.full(distance.shape, _echo(_BLOOD)))
-        if self.labels.keys() & THROMBUS and _THROMBUS_ENDS[0] < y < _THROMBUS_ENDS[1]:
+        if self._thrombus[0] < y < self._thrombus[1]:
             clot = _echo(-39.0 + 3.0 * self._cloud.plane(x, y, z))
             section.fill("vein thrombus", walls[1] < 0.0, clot)
         self._nerve(section, walls[2])
