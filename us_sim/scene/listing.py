@@ -10,7 +10,7 @@ from pathlib import Path
 
 from us_sim.errors import UsSimError
 from us_sim.scene.reading import find_scene, installed_scenes, load_scene
-from us_sim.scene.scene import CASE_PREFIX
+from us_sim.scene.scene import CASE_PREFIX, EXERCISE_PREFIX
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class ListedScene:
 
     name: str
     origin: str  # what loads it: a scene's file, or `case:` and the case's folder
-    kind: str = "scene"  # or case
+    kind: str = "scene"  # or case, or exercise
     description: str = ""
     region: str = ""  # of the body
     structures: tuple[str, ...] = ()
@@ -29,9 +29,16 @@ class ListedScene:
 
 
 def listed_scenes() -> Iterator[ListedScene]:
-    """Installed scenes, then the cases of `case_roots`; each name once."""
+    """List exercises that name a scene, installed scenes, cases of `case_roots`; each name once."""
+    from us_sim.scoring.exercise import installed_exercises
     from us_sim.volume.cases.case import case_roots, cases_in
 
+    for exercise in installed_exercises():
+        if exercise.scene is not None:
+            origin, about = f"{EXERCISE_PREFIX}{exercise.origin}", exercise.description
+            yield ListedScene(
+                exercise.name, origin, "exercise", f"{about} {exercise.minutes} min", exercise.scene
+            )
     for file in installed_scenes().values():
         yield listed_scene(str(file))
     folders: dict[str, Path] = {}

@@ -15,6 +15,7 @@
 from __future__ import annotations
 
 import os
+import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +31,7 @@ from us_sim.scene.building import (
     source_settings,
     tracking_of,
 )
-from us_sim.scene.scene import CASE_PREFIX, Scene, TissueSettings
+from us_sim.scene.scene import CASE_PREFIX, EXERCISE_PREFIX, Scene, TissueSettings
 from us_sim.settings.choice import Choice
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, kinds_of, rules_of
@@ -271,10 +272,11 @@ def find_scene(name: str | Path) -> Path:
 
 
 def load_scene(name: str | Path, *, volume: str | Path | None = None) -> Scene:
-    """Read and validate a scene file, or make a scene of a case: ``case:NAME``.
+    """Read and validate a scene file, or make a scene of a case or for an exercise.
 
     Args:
-        name: of the scene, or its file; or ``case:`` with the name or the folder of a case.
+        name: of the scene, or its file; or ``case:`` with the name or the folder of a case, or
+            ``exercise:`` with the name or the file of an exercise.
         volume: a file in place of the scene's.
 
     Raises:
@@ -287,7 +289,7 @@ def load_scene(name: str | Path, *, volume: str | Path | None = None) -> Scene:
 
 
 def scene_document(name: str | Path) -> tuple[Any, list[Path], str]:
-    """The document of a scene or ``case:`` and a case, the folders of its files, its origin.
+    """Return the document of a scene, case or exercise, the folders of its files, its origin.
 
     Raises:
         SceneError: it cannot be found or read.
@@ -299,9 +301,38 @@ def scene_document(name: str | Path) -> tuple[Any, list[Path], str]:
         except CaseError as error:
             raise SceneError(str(error)) from error
         return {"case": str(folder)}, [folder.parent], f"{CASE_PREFIX}{folder}"
+    if str(name).startswith(EXERCISE_PREFIX):
+        return _exercise_document(str(name).removeprefix(EXERCISE_PREFIX))
     path = find_scene(name)
     document, folders = read_document(path, find_scene)
     return document, folders, str(path)
+
+
+def _exercise_document(name: str) -> tuple[Any, list[Path], str]:
+    """Return the document of an exercise's scene, its folders, and an origin with the seed drawn.
+
+    Args:
+        name: of the exercise, or its file; behind a ``#`` the seed, else one is drawn.
+    """
+    from us_sim.scoring.exercise import read_exercise
+
+    file, _, given = name.partition("#")
+    try:
+        exercise = read_exercise(file)
+    except UsSimError as error:
+        raise SceneError(str(error)) from error
+    origin = f"{EXERCISE_PREFIX}{exercise.origin}"
+    if exercise.scene is None:
+        raise SceneError(f"{origin}: scene: is missing; name the one that it is done in")
+    document, folders = read_document(find_scene(exercise.scene), find_scene)
+    more: dict[Any, Any] = {"name": Path(exercise.origin).stem, "exercise": exercise.origin}
+    more["description"] = exercise.description
+    if exercise.seeds is not None:
+        low, high = exercise.seeds
+        seed = int(given) if given.isdecimal() else random.randint(low, high)
+        more["volume"] = {"seed": seed}
+        origin += f"#{seed}"
+    return merged(document, more), folders, origin
 
 
 def with_volume(document: dict[Any, Any], file: str) -> dict[Any, Any]:

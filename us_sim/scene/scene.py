@@ -34,6 +34,7 @@ from us_sim.tracking.settings import GateSettings
 from us_sim.volume.settings import VolumeSettings
 
 CASE_PREFIX = "case:"
+EXERCISE_PREFIX = "exercise:"
 """Before the name or the folder of a case, in place of a scene's name."""
 
 

@@ -404,6 +404,9 @@ class Exercise(Settings):
     task: Chosen = setting(choice=EXERCISES)
     description: str = setting(description="of what is to be done, for the learner", default="")
     scene: str | None = setting(description="scene that it is made for", default=None)
+    lesson: int | None = setting(
+        Quantity("number", 1, 100), "number of it in a lesson of several", default=None
+    )
     minutes: int = setting(Quantity("number", 1, 240), "that it takes about", default=5)
     feedback: str = setting(
         description="live: what is right is said at once; afterwards: the page shows what a "
@@ -459,13 +462,25 @@ def read_exercise(name: str | Path) -> Exercise:
     """
     path = Path(os.path.expanduser(name))
     if not path.is_file():
-        known = {f.stem: f for r in shared_roots() for f in (r / "config/exercises").glob("*.yaml")}
+        known = _installed_files()
         if str(name) not in known:
             raise ScoreError(f"exercise {unknown(str(name), sorted(known))}")
         path = known[str(name)]
     exercise = Reader(str(path), None, ScoreError).read(Exercise, read_yaml(path, ScoreError))
     checksum = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
     return replace(exercise, origin=str(path.resolve()), checksum=checksum)
+
+
+def installed_exercises() -> list[Exercise]:
+    """Read those in ``config/exercises``: the lesson in its order, then the others by name."""
+    found = [read_exercise(file) for file in _installed_files().values()]
+    return sorted(found, key=lambda each: (each.lesson or len(found) + 1, each.name))
+
+
+def _installed_files() -> dict[str, Path]:
+    return {
+        f.stem: f for root in shared_roots() for f in (root / "config/exercises").glob("*.yaml")
+    }
 
 
 def result_of(done: Sequence[bool]) -> str:
