@@ -39,9 +39,12 @@ class Scorer:
         if what == "draw":
             self.picture.offer(lambda n: Packet(PICTURE, n, {}, PNG))
 
-    def say(self, steps):
+    def say(self, steps, feedback="live"):
         header = {"name": "Compression", "description": "Compress the vein.", "scene": "arm"}
-        header |= {"metrics": {"Path Length, mm": "60"}, "steps": list(steps)}
+        header |= {"metrics": {"Path Length, mm": "60"}, "steps": list(steps), "faults": []}
+        is_done = all(step["state"] == "done" for step in header["steps"])
+        header |= {"state": "passed" if is_done else "running", "plain": {"Time, s": "12"}}
+        header |= {"about": {"begun": "now", "feedback": feedback}}
         self.score.offer(lambda n: Packet(SCORE, n, header, b""))
 
 
@@ -50,18 +53,19 @@ def test_task_steps_and_score_are_shown_begun_anew_and_saved(page, simulator):
     page.goto(page.address)
     page.locator("#us-panels").click()
     page.get_by_role("tab", name="Exercise").click()
-    page.get_by_text("No exercise is followed").wait_for()
+    page.get_by_text("No exercise is followed: choose one.").wait_for()
     until(lambda: scorer.picture.is_watched, "the panel is seen")
     scorer.say(STEPS)
     page.get_by_text("To do: vein at <b>29 mm, not reached").wait_for()
     page.get_by_text("Done: vein at 9 mm, closed at 6.0 N").wait_for()
-    page.get_by_text("1 of 2 done", exact=True).wait_for()
-    page.get_by_text("Score so far").click()
+    page.get_by_text("goes on: 1 of 2 done, 12 s", exact=True).wait_for()
+    page.get_by_text("More", exact=True).click()
     page.get_by_text("Path Length, mm").wait_for()
     page.get_by_role("button", name="Begin anew").click()
+    page.get_by_role("button", name="Erase it").click()
     until(lambda: scorer.asked == ["clear"], "it is asked for")
     scorer.say({**step, "state": "done"} for step in STEPS)
-    page.get_by_text("passed: 2 of 2 done", exact=True).wait_for()
+    page.get_by_text("passed: 2 of 2 done, 12 s", exact=True).wait_for()
     with page.expect_download() as download:
         page.get_by_role("button", name="Save the result").click()
     kept = Path(download.value.path()).read_text()
@@ -89,8 +93,17 @@ def test_what_the_scorer_says_is_heard_while_a_page_shows_it(bench, heard):
     target = KeyValue(key="target", value=json.dumps([[0.0, 0.01, 0.02]]))
     wrong = [KeyValue(key="target", value=text) for text in ("[[1, 2]]", "{", '["a"]', "[1e999]")]
     steps = [
-        DiagnosticStatus(name="5 N", level=DiagnosticStatus.ERROR, message="2 s", values=[target]),
-        *(DiagnosticStatus(level=DiagnosticStatus.WARN, values=[each]) for each in wrong),
+        DiagnosticStatus(
+            name="5 N",
+            hardware_id="step",
+            level=DiagnosticStatus.ERROR,
+            message="2 s",
+            values=[target],
+        ),
+        *(
+            DiagnosticStatus(hardware_id="step", level=DiagnosticStatus.WARN, values=[each])
+            for each in wrong
+        ),
     ]
     publisher.publish(DiagnosticArray(status=[first, *steps]))
     pictures.publish(CompressedImage(format="png", data=PNG))

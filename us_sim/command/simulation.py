@@ -26,7 +26,7 @@ from us_sim.errors import UsSimError
 from us_sim.run.processes import begin_fork_server, prepare_ros
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-from us_sim.share import find_bag
+from us_sim.share import find_bag, full_path
 
 if TYPE_CHECKING:
     from us_sim.run.plan import Request
@@ -147,6 +147,12 @@ def view_options(parser: argparse.ArgumentParser) -> None:
         help="take poses from the scene's own tracker; default: from the hand in the page, and "
         "from whatever else publishes tracker/pose",
     )
+    parser.add_argument("--student", default="", help="name that results of exercises bear")
+    parser.add_argument(
+        "--results",
+        metavar="ADDRESS",
+        help="folder, or address of fsspec, to which the result of each attempt is written",
+    )
     parser.add_argument(
         "--attach", action="store_true", help="show a simulation that runs already, anywhere"
     )
@@ -178,10 +184,25 @@ def _view(args: argparse.Namespace) -> int:
         record=read_settings(args, RunSettings, ("record",)).record,
         view=viewer(args),
         by_hand=not args.tracker,
+        student=args.student,
+        results=_results_address(args),
         playing={"stay": True, "loop": args.loop} if args.path is not None else {},
     )
     prepare_ros(network=args.network)
     return run(request, supervision)
+
+
+def _results_address(args: argparse.Namespace) -> str | None:
+    """Return where results go, a folder from wherever nodes run.
+
+    Raises:
+        UsSimError: there is a student and no place.
+    """
+    if args.results is None:
+        if args.student:
+            raise UsSimError(f"--student {args.student}: say with --results where results go")
+        return None
+    return str(args.results) if "://" in args.results else str(full_path(args.results))
 
 
 _OF_THE_PLAYER = ("rate", "loop", "time")

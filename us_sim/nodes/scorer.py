@@ -160,7 +160,7 @@ class Scorer(SceneNode):
         result = self._result(score)
         message = DiagnosticArray(status=[told, *map(_step_status, score.steps)])
         for fault in result["faults"]:
-            values = {"seconds": f"{fault['seconds']:.1f}"}
+            values = {"seconds": fault["seconds"]}
             message.status.append(_status("fault", fault["what"], values, DiagnosticStatus.WARN))
         message.status.append(_status("plain", result["state"], result["plain"]))
         message.status.append(_status("about", "", result["about"]))
@@ -182,7 +182,7 @@ class Scorer(SceneNode):
             "changed": "; ".join(self._changes),
             "us_sim": version("us_sim"),
         }
-        faults = [{"seconds": each.time, "what": each.what} for each in score.faults]
+        faults = [{"seconds": round(each.time, 1), "what": each.what} for each in score.faults]
         if self._void:
             faults.insert(0, {"seconds": 0.0, "what": self._void})
         return {

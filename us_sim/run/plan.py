@@ -65,6 +65,8 @@ class Request:
     view: ViewerSettings | None = None  # address of the page that shows it; None is no page
     by_hand: bool = False  # poses come on `tracker/pose`, whatever the scene's tracker is
     duration: float | None = None  # s, after which all ends
+    student: str = ""  # name that results of exercises bear
+    results: str | None = None  # folder, or address of fsspec, that they are written to
     is_changed: bool = False  # while it ran: parameters may be of nodes that do not run now
 
     def with_path(self) -> Request:
@@ -184,7 +186,10 @@ def plan_of(request: Request) -> Plan:
     for node in needed:
         is_played = node == "probe_tracker" and (played or request.by_hand)
         source = {"source": "pose"} if is_played else {}
-        processes.append(NodeProcess(node, common | source | taken(node)))
+        kept: dict[str, object] = {}
+        if node == "scorer" and request.results:
+            kept = {"student": request.student, "results": request.results}
+        processes.append(NodeProcess(node, common | source | kept | taken(node)))
     if given:
         raise UsSimError(
             f"--param {next(iter(given))}: this scene does not run such a node; it runs "

@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 from us_sim.errors import ScoreError
 from us_sim.scoring.centre_line import CentreLine
 from us_sim.scoring.exercise import (
-    ANSWERS,
     IN_AIR,
     LENGTH,
-    NO_THROMBUS,
     PART,
     Attempt,
     Fault,
@@ -27,6 +25,7 @@ from us_sim.scoring.exercise import (
     Task,
 )
 from us_sim.scoring.metrics import Scan
+from us_sim.scoring.settings import ANSWERS, NO_THROMBUS
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.slicing.settings import WALLS_TOUCH

@@ -34,9 +34,6 @@ from us_sim.share import shared_roots
 
 LENGTH, PART = Quantity("length", 1e-4, 1.0), Quantity("number", 0.0, 1.0)
 _TIME, _FORCE = Quantity("time", 0.1, 3600.0), "force"
-ANSWERS = ("compressible", "not compressible", "not seen")
-"""Of a learner, on a point of a vein."""
-NO_THROMBUS = "none"
 IN_AIR = 0.1
 """N, below which the probe touches nothing."""
 _MM = 1e3
@@ -112,20 +109,20 @@ class TimedAttempt(Attempt):
 
     def __init__(self, attempt: Attempt) -> None:
         self._attempt = attempt
-        self._has_begun = False
+        self.was_in_air = False
         self._touched: float | None = None  # s
         self._time = 0.0  # s, of the last pose
 
     def add(self, scan: Scan) -> None:
         """Take the samples that are new, from the first in the air on."""
-        if scan.force is not None and not self._has_begun:
+        if scan.force is not None and not self.was_in_air:
             new = scan.force.times > scan.since
             in_air = scan.force.times[new & (scan.force.newtons < IN_AIR)]
             if not len(in_air):
                 return
             since = float(np.nextafter(in_air[0], -np.inf))
             scan = replace(scan, since=max(scan.since, since))
-            self._has_begun = True
+            self.was_in_air = True
         self._time = float(scan.motion.times[-1])
         if self._touched is None:
             times = scan.motion.times

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import ScoreError
 from us_sim.geometry.pose import Pose
-from us_sim.scoring.exercise import Attempt, Exercise, Fault, Step
+from us_sim.scoring.exercise import Exercise, Fault, Step, TimedAttempt
 from us_sim.scoring.lumen import LumenMeter, lumens_of, vessels_in
 from us_sim.scoring.metrics import Force, Metric, Scan, Tally
 from us_sim.scoring.motion import Motion
@@ -36,6 +36,7 @@ class Score(NamedTuple):
     faults: Sequence[Fault] = ()
     seconds: float | None = None  # from the first touch to the end, or so far; None before
     has_ended: bool = False  # all was done, or the time is over
+    was_in_air: bool = True  # the probe, since the scene was loaded; nothing counts before
 
 
 class LiveScan:
@@ -143,7 +144,8 @@ class LiveScan:
         if attempt is None:
             return Score(metrics)
         steps, faults = attempt.steps(), attempt.faults()
-        return Score(metrics, steps, faults, attempt.seconds(), attempt.ended is not None)
+        has_ended = attempt.ended is not None
+        return Score(metrics, steps, faults, attempt.seconds(), has_ended, attempt.was_in_air)
 
     def _settle(self) -> None:
         """Add what later samples cannot change any more."""
@@ -180,7 +182,7 @@ def _span(times: list[float], since: float, until: float, before: int) -> tuple[
     return max(bisect_right(times, since) - before, 0), bisect_right(times, until)
 
 
-def _add(tally: Tally, attempt: Attempt | None, scan: Scan) -> None:
+def _add(tally: Tally, attempt: TimedAttempt | None, scan: Scan) -> None:
     tally.add(scan)
     if attempt is not None:
         attempt.add(scan)

@@ -23,15 +23,8 @@ import numpy as np
 from us_sim.errors import ScoreError
 from us_sim.scoring.live import Score
 from us_sim.scoring.metrics import DEFINITIONS, Metric
+from us_sim.scoring.settings import STATES
 
-STATES = {
-    "to do": "nothing done yet",
-    "running": "goes on",
-    "passed": "passed",
-    "not passed": "not passed",
-    "void": "void",
-}
-"""Words for what became of an attempt."""
 MARKS = {"done": "✓", "missed": "✗", "to do": "○"}
 """Of steps, by their states."""
 _STYLE = (
@@ -62,7 +55,7 @@ def state_of(score: Score, void: str = "") -> str:
     if void:
         return "void"
     if score.seconds is None:
-        return "to do"
+        return "to do" if score.was_in_air else "to lift"
     if score.has_ended:
         return "passed" if all(step.is_done for step in score.steps) else "not passed"
     return "running"
@@ -77,7 +70,7 @@ def result_page(result: Mapping[str, Any], picture: bytes = b"") -> str:
     """
     title = escape(result["name"])
     steps = [(MARKS[s["state"]], s["what"], s["seen"]) for s in result["steps"]]
-    faults = [(f"{each['seconds']:.0f} s", each["what"]) for each in result["faults"]]
+    faults = [(f"{each['seconds']} s", each["what"]) for each in result["faults"]]
     more = [
         (label, text, DEFINITIONS.get(_name(label), ""))
         for label, text in result["metrics"].items()

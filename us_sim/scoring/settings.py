@@ -1,4 +1,4 @@
-"""Limits of a score: what all nodes read of it, and so without SciPy."""
+"""Limits of a score, and words for it: what is read without SciPy."""
 
 from __future__ import annotations
 
@@ -8,6 +8,20 @@ from typing import ClassVar
 from us_sim.errors import ScoreError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
+
+STATES = {
+    "to lift": "lift the probe off the skin to begin",
+    "to do": "begins when the probe touches the skin",
+    "running": "goes on",
+    "passed": "passed",
+    "not passed": "not passed",
+    "void": "void",
+}
+"""Words for what became of an attempt."""
+ANSWERS = ("compressible", "not compressible", "not seen")
+"""Of a learner, on a point of a vein."""
+NO_THROMBUS = "none"
+"""Likewise, on where it is."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from nicegui import ui
 from us_sim.errors import UsSimError
 from us_sim.slicing.settings import OVERLAYS, STRIPS
 from us_sim.viewer.export import LARGEST, exported, frames_of
-from us_sim.viewer.panels.exercise import ExercisePanel, told_score
+from us_sim.viewer.panels.exercise import ExercisePanel, is_blind, told_score
 from us_sim.viewer.panels.nodes import build_image, build_plots, build_status, build_tissue
 from us_sim.viewer.panels.session import CasesPanel, SessionPanel
 from us_sim.viewer.parameters import Kind
@@ -128,6 +128,11 @@ class ModeBar:
         known = parameter.raw if parameter else None
         if self._mode != "b-mode" and known in MODES and known != self._mode:
             self._show(known)
+        hides = is_blind(told_score(self._simulator))
+        if hides and self._mode != "b-mode":
+            self._show("b-mode")
+        for name in (*MODES, BESIDE):
+            self._buttons[name].set_visibility(not hides or name == "b-mode")
         self._mark()
 
     def _wanted_remarks(self) -> list[str]:
@@ -274,9 +279,10 @@ def _status(simulator: Simulator) -> None:
     build_plots(simulator)
 
 
+TISSUE_TAB = "Tissue"
 PANELS = [
     ("Image", "contrast", "The scanner's console: depth, gain, focus and more", build_image),
-    ("Tissue", "layers", "Method, materials, skin and tracker", build_tissue),
+    (TISSUE_TAB, "layers", "Method, materials, skin and tracker", build_tissue),
     ("Cases", "collections", "Scenes and cases to load", CasesPanel),
     ("Session", "radio_button_checked", "Record, and replay recordings", SessionPanel),
     ("Exercise", "school", "A task, what is done of it, and the score", ExercisePanel),
@@ -307,7 +313,7 @@ def build_page(simulator: Simulator) -> None:
             _block("strips")
             _block("image-tools")
         with _section("us-drawer", "Panels") as drawer:
-            tabs = _panels(simulator)
+            tabs, tissue = _panels(simulator)
     drawer.set_visibility(False)
     button.props["title"] = "Panels: image, tissue, cases, session, exercise, status"
     button.props["aria-label"] = "Panels"
@@ -325,7 +331,15 @@ def build_page(simulator: Simulator) -> None:
             if not drawer.visible:
                 toggle()
 
+    def hide_truth() -> None:
+        """Leave out what tells of what there is to be found, while an exercise asks."""
+        hides = is_blind(told_score(simulator))
+        tissue.set_visibility(not hides)
+        if hides and tabs.value == TISSUE_TAB:
+            tabs.set_value("Exercise")
+
     button.on_click(toggle)
+    ui.timer(0.5, hide_truth)
     asking = ui.timer(0.5, show_exercise)
 
 
@@ -341,15 +355,18 @@ def _section(name: str, label: str) -> ui.element:
     return section
 
 
-def _panels(simulator: Simulator) -> ui.tabs:
+def _panels(simulator: Simulator) -> tuple[ui.tabs, ui.tab]:
+    """Make the panels; return their tabs, and the one of the tissue."""
+    made = {}
     with ui.tabs().props("dense no-caps").classes("us-tabs") as tabs:
         for name, icon, title, _ in PANELS:
-            ui.tab(name, icon=icon).props["title"] = title
+            made[name] = ui.tab(name, icon=icon)
+            made[name].props["title"] = title
     with ui.tab_panels(tabs, value=PANELS[0][0]).classes("us-panels"):
         for name, _, _, build in PANELS:
             with ui.tab_panel(name):
                 build(simulator)
-    return tabs
+    return tabs, made[TISSUE_TAB]
 
 
 ASSETS = Path(__file__).parent / "assets"

@@ -15,6 +15,7 @@ from us_sim.nodes.guarded_node import GuardedNode, shown
 from us_sim.nodes.qos import LATCHED, STREAM, overridable
 from us_sim.nodes.topics import FROZEN
 from us_sim.recording.topic import MARKER
+from us_sim.scoring.settings import STATES
 from us_sim.viewer.feeds import topic_feed
 from us_sim.viewer.stream import Packet, Posted, Simulator
 
@@ -53,16 +54,29 @@ def add_score(node: GuardedNode, post: Posted, simulator: Simulator) -> None:
 
 
 def score_packet(message: DiagnosticArray, sequence: int) -> Packet:
-    """Name, description, scene, metrics, and steps with their states, without a payload."""
-    first, *steps = message.status or [DiagnosticStatus()]
+    """Return a packet of the document of `us_sim.scoring.result`, without a payload."""
+    first, *others = message.status or [DiagnosticStatus()]
+    of_kind: dict[str, list[DiagnosticStatus]] = {}
+    for status in others:
+        of_kind.setdefault(shown(status.hardware_id), []).append(status)
+    plain, about = (of_kind.get(kind, [DiagnosticStatus()])[0] for kind in ("plain", "about"))
+    faults = [{"what": shown(each.message), **_values(each)} for each in of_kind.get("fault", [])]
     header = {
         "name": shown(first.name),
         "description": shown(first.message),
         "scene": shown(first.hardware_id),
-        "metrics": {shown(each.key): shown(each.value) for each in first.values},
-        "steps": [_step(status) for status in steps],
+        "state": plain.message if plain.message in STATES else "to lift",
+        "about": {"begun": "", "feedback": "live", **_values(about)},
+        "plain": _values(plain),
+        "steps": [_step(status) for status in of_kind.get("step", [])],
+        "faults": [{"seconds": "", **each} for each in faults],
+        "metrics": _values(first),
     }
     return Packet(SCORE, sequence, header, b"")
+
+
+def _values(status: DiagnosticStatus) -> dict[str, str]:
+    return {shown(each.key): shown(each.value) for each in status.values}
 
 
 def _step(status: DiagnosticStatus) -> dict[str, Any]:

@@ -1,18 +1,20 @@
-"""The panel of an exercise: the task, what is done of it, the metrics so far, and the result."""
+"""The panel of an exercise: which there are, the task, what is done of it, and the result."""
 
 from __future__ import annotations
 
 import asyncio
-import base64
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
-from html import escape
 from typing import Any
 
 from nicegui import ui
 
+from us_sim.scene.listing import ListedScene
+from us_sim.scoring.settings import ANSWERS, NO_THROMBUS, STATES
 from us_sim.viewer.panels.controls import WhileShown
+from us_sim.viewer.remote_parameters import in_time
 from us_sim.viewer.score import PICTURE, SCORE
+from us_sim.viewer.session import CONTROL
 from us_sim.viewer.stream import Feed, Simulator
 
 EVERY_S = 0.5
@@ -20,10 +22,13 @@ EVERY_S = 0.5
 ANSWER_S = 30.0
 """For a picture to be drawn: of an hour it takes seconds, on a busy computer more."""
 TITLE = "Exercise"
-NOTHING = (
-    "No exercise is followed: load a scene that has one, such as upper arm thrombosis, or start "
-    "the node scorer."
+NOTHING = "No exercise is followed: choose one."
+HINTS = (
+    "Drag the probe over the skin to place it; drag down on the image to press.",
+    "The dots on the skin are the points of the list; the image says force and press.",
+    "Begin anew forgets what was done. Save the result keeps it as a page.",
 )
+"""For who sees the panel for the first time."""
 _LOOKS = {
     "done": ("Done", "check_circle"),
     "missed": ("Missed", "cancel"),
@@ -31,22 +36,32 @@ _LOOKS = {
 }
 """Words and icons of Material's, by states of steps."""
 _ALT = "The probe's way over the skin, with the force; force and areas of vessels over time"
+_SCORER = "scorer"
 
 
 class ExercisePanel:
     """The panel of an exercise: every page shows the same, so that a teacher sees a learner's."""
 
     def __init__(self, simulator: Simulator) -> None:
-        self._simulator = simulator
+        self._simulator, self._board = simulator, simulator.session
+        self._scorer = simulator.nodes.of(_SCORER)
         self._watched: list[Feed] = []
         self._told: Mapping[str, Any] | None = None  # what is shown
+        self._listed: tuple[object, ...] = ()  # exercises that are shown
+        self._parts: dict[str, Any] = {}  # of it, as they are drawn
         self._picture = b""
         with WhileShown(self._begin, self._end, EVERY_S, self._refresh):
+            self._choice = ui.expansion("Exercises").classes("us-cases-more")
+            with self._choice:
+                self._list = ui.column().classes("us-steps")
             self._name = ui.label(TITLE).classes("us-heading")
             self._name.props('role="heading" aria-level="2"')
             self._about = ui.label().classes("us-note")
+            self._hints = ui.column().classes("us-steps")
+            self._show_hint(0)
             self._result = ui.label().classes("us-session-state").props('role="status"')
             self._steps = ui.column().classes("us-steps")
+            self._faults = ui.column().classes("us-steps us-session-problem")
             with ui.row() as self._buttons:
                 for label, title, work in (
                     ("Begin anew", "Forget what was done so far", self._clear),
@@ -55,9 +70,10 @@ class ExercisePanel:
                 ):
                     button = ui.button(label, on_click=work).props("flat dense no-caps")
                     button.props["title"] = title
+            self._plain = ui.grid(columns=2).classes("us-metrics")
             self._image = ui.image().classes("us-score-picture").props("no-spinner")
             self._image.props["alt"] = _ALT
-            with ui.expansion("Score so far").classes("us-cases-more"):
+            with ui.expansion("More").classes("us-cases-more"):
                 self._metrics = ui.grid(columns=2).classes("us-metrics")
 
     def _begin(self) -> None:
@@ -65,10 +81,14 @@ class ExercisePanel:
         self._watched = [feeds[kind] for kind in (SCORE, PICTURE) if kind in feeds]
         for feed in self._watched:
             feed.watch(self._changed)
+        self._board.watch()
+        self._scorer.watch()
 
     def _end(self) -> None:
         for feed in self._watched:
             feed.unwatch(self._changed)
+        self._board.unwatch()
+        self._scorer.unwatch()
 
     def _changed(self) -> None:
         """Nothing: the panel looks twice a second."""
@@ -83,36 +103,124 @@ class ExercisePanel:
         if told != self._told:
             self._told = told
             self._show(told)
+        exercises = [each for each in self._board.scenes if each.kind == "exercise"]
+        listed = (*exercises, self._board.state.origin, self._board.state.is_busy)
+        if listed != self._listed:
+            self._listed = listed
+            self._show_list(exercises)
         picture = self._drawn() if told.get("name") else b""
         if picture != self._picture or self._image.visible != bool(picture):
             self._picture = picture
-            self._image.set_source(_data(picture) if picture else "")
+            self._image.set_source(_address(picture) if picture else "")
             self._image.set_visibility(bool(picture))
+
+    def _show_list(self, exercises: Iterable[ListedScene]) -> None:
+        state = self._board.state
+        self._list.clear()
+        with self._list:
+            for number, each in enumerate(exercises, 1):
+                is_loaded = state.origin.partition("#")[0] == each.origin
+                button = ui.button(
+                    f"{number}. {each.name}", on_click=lambda each=each: self._load(each)
+                ).props("flat dense no-caps align=left")
+                button.props["title"] = f"{each.description} In {each.region.replace('_', ' ')}"
+                button.props["aria-current"] = str(is_loaded).lower()
+                button.set_enabled(state.is_there and not state.is_busy)
+
+    async def _load(self, exercise: ListedScene) -> None:
+        if await self._is_sure(f"Loading {exercise.name}"):
+            refused = await in_time(self._board.ask(scene=exercise.origin), CONTROL)
+            if refused:
+                ui.notify(refused, type="warning", multi_line=True)
+            else:
+                self._choice.close()
+
+    async def _is_sure(self, what: str) -> bool:
+        """Ask where an attempt would be erased."""
+        if (self._told or {}).get("state") != "running":
+            return True
+        with ui.dialog() as dialog, ui.card():
+            dialog.props["aria-label"] = "Erase the attempt"
+            ui.label(f"{what} erases the attempt that goes on.")
+            with ui.row():
+                ui.button("Erase it", on_click=lambda: dialog.submit(True)).props("no-caps")
+                ui.button("Go on", on_click=lambda: dialog.submit(False)).props("flat no-caps")
+        return bool(await dialog)
+
+    def _show_hint(self, number: int) -> None:
+        self._hints.clear()
+        if number == len(HINTS):
+            return
+        with self._hints, ui.row(wrap=False).classes("us-step"):
+            ui.label(HINTS[number]).classes("us-note")
+            closing = ui.button(icon="close", on_click=lambda: self._show_hint(number + 1))
+            closing.props("flat dense round size=sm aria-label='Next hint'")
 
     def _show(self, told: Mapping[str, Any]) -> None:
         name, steps = told.get("name", ""), told.get("steps", [])
         self._name.set_text(name or TITLE)
         self._about.set_text(told["description"] if name else NOTHING)
-        done = _done(steps)
-        passed = "passed: " if all(done) else ""
-        self._result.set_text(f"{passed}{sum(done)} of {len(done)} done" if done else "")
+        self._hints.set_visibility(bool(steps))
+        done = [step["state"] == "done" for step in steps]
+        seconds = next(iter(told.get("plain", {}).values()), "-")
+        clock = f", {seconds} s" if seconds != "-" else ""
+        state = STATES[told.get("state", "to lift")]
+        asks = is_blind(told) and told["state"] == "running"
+        count = "" if is_blind(told) else f": {sum(done)} of {len(done)} done"
+        self._result.set_text(f"{state}{count}{clock}" if done else "")
         self._buttons.set_visibility(bool(name))
-        self._steps.clear()
-        self._metrics.clear()
-        with self._steps:
-            for step in steps:
-                word, icon = _LOOKS[step["state"]]
-                with ui.row(wrap=False).classes("us-step") as row:
-                    row.props["data-state"] = step["state"]
-                    ui.icon(icon)
-                    ui.label(f"{word}: {step['what']}, {step['seen']}")
-        with self._metrics:
-            for label, value in told.get("metrics", {}).items():
-                ui.label(label).classes("us-quiet")
-                ui.label(value)
+        parts = {"steps": (steps, asks), "faults": told.get("faults", [])}
+        parts |= {kind: told.get(kind, {}) for kind in ("plain", "metrics")}
+        draws = {
+            "steps": (self._steps, lambda: self._draw_steps(steps, asks)),
+            "faults": (self._faults, lambda: _draw_faults(parts["faults"])),
+            "plain": (self._plain, lambda: _draw_metrics(parts["plain"])),
+            "metrics": (self._metrics, lambda: _draw_metrics(parts["metrics"])),
+        }
+        for kind, (part, draw) in draws.items():
+            if parts[kind] != self._parts.get(kind):  # a button must not go under a click
+                part.clear()
+                with part:
+                    draw()
+        self._parts = parts
 
-    def _clear(self) -> None:
-        self._simulator.ask_scorer("clear")
+    def _draw_steps(self, steps: Sequence[Mapping[str, Any]], asks: bool) -> None:
+        for number, step in enumerate(steps):
+            word, icon = _LOOKS[step["state"]]
+            with ui.row(wrap=False).classes("us-step") as row:
+                row.props["data-state"] = step["state"]
+                ui.icon(icon)
+                ui.label(f"{word}: {step['what']}, {step['seen']}")
+            if asks and step["state"] == "to do":
+                self._ask(number, step["what"], len(steps))
+
+    def _ask(self, number: int, what: str, count: int) -> None:
+        """Make the buttons by which the learner answers on a point, or on the thrombus."""
+        points = [f"{k + 1}" for k in range(count - 1)]
+        is_last = number == len(points)
+        with ui.row().classes("us-answers"):
+            for answer in (NO_THROMBUS, *points) if is_last else ANSWERS:
+                button = ui.button(
+                    f"at {answer}" if answer.isdigit() else answer,
+                    on_click=lambda answer=answer: self._answer(number, answer, is_last),
+                ).props("outline dense no-caps size=sm")
+                button.props["aria-label"] = f"{what}: {answer}"
+
+    async def _answer(self, number: int, answer: str, is_last: bool) -> None:
+        if is_last:
+            refused = await self._scorer.set("thrombus", answer)
+        else:
+            known = self._scorer.parameters.get("answers")
+            answers = list(known.raw) if known is not None else []
+            answers += [""] * (number + 1 - len(answers))
+            answers[number] = answer
+            refused = await self._scorer.set("answers", answers)
+        if refused:
+            ui.notify(refused, type="warning", multi_line=True)
+
+    async def _clear(self) -> None:
+        if await self._is_sure("Begin anew"):
+            self._simulator.ask_scorer("clear")
 
     async def _draw(self) -> bool:
         """Have the picture drawn anew; whether it was."""
@@ -127,45 +235,40 @@ class ExercisePanel:
         return False
 
     async def _save(self) -> None:
+        from us_sim.scoring.result import result_page  # it brings scipy, which only this takes
+
         if await self._draw():
             now = datetime.now().strftime("%Y-%m-%d-%H-%M-%S")
-            page = result_page(told_score(self._simulator), self._drawn(), now)
+            page = result_page(told_score(self._simulator), self._drawn())
             ui.download.content(page, f"us_sim-{now}.html", "text/html")
 
 
+def _draw_faults(faults: Iterable[Mapping[str, str]]) -> None:
+    for fault in faults:
+        ui.label(f"{fault['seconds']} s: {fault['what']}")
+
+
+def _draw_metrics(metrics: Mapping[str, str]) -> None:
+    for label, value in metrics.items():
+        ui.label(label).classes("us-quiet")
+        ui.label(value)
+
+
 def told_score(simulator: Simulator) -> Mapping[str, Any]:
-    """The newest score of the scene that runs; empty where there is none."""
+    """Return the newest score of the scene that runs; empty where there is none."""
     feed, state = simulator.feeds.get(SCORE), simulator.session.state
     packet = feed.newest() if feed is not None else None
     is_other = packet is not None and state.is_there and packet.header["scene"] != state.scene
     return {} if packet is None or is_other else packet.header
 
 
-def result_page(told: Mapping[str, Any], picture: bytes, when: str) -> str:
-    """A page in one file, with steps, picture and metrics of a score as its stream tells it."""
-    from us_sim.scoring.exercise import result_of  # it brings scipy, which only this takes
-
-    steps = [(_LOOKS[s["state"]][0], s["what"], s["seen"]) for s in told.get("steps", [])]
-    result = result_of(_done(told["steps"])) if steps else ""
-    title = escape(told["name"])
-    return (
-        f'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
-        "<style>body {font-family: sans-serif; max-width: 70em; margin: 2em auto} "
-        "td {padding: 0 1em 0 0} img {max-width: 100%}</style>"
-        f"<h1>{title}</h1><p>{escape(told['description'])}</p>"
-        f"<p>us_sim, {escape(told['scene'])}, {when}, simulated</p><p>{result}</p>{_table(steps)}"
-        f'<img src="{_data(picture)}" alt="{_ALT}">{_table(told["metrics"].items())}</html>'
-    )
+def is_blind(told: Mapping[str, Any]) -> bool:
+    """Return whether nothing may be shown of a score's scene that a scanner does not show."""
+    is_hidden = told.get("about", {}).get("feedback") == "afterwards"
+    return is_hidden and told["state"] not in ("passed", "not passed")
 
 
-def _table(rows: Iterable[tuple[str, ...]]) -> str:
-    cells = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
-    return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
+def _address(picture: bytes) -> str:
+    from us_sim.scoring.result import picture_address
 
-
-def _data(picture: bytes) -> str:
-    return f"data:image/png;base64,{base64.b64encode(picture).decode()}"
-
-
-def _done(steps: Iterable[Mapping[str, Any]]) -> list[bool]:
-    return [step["state"] == "done" for step in steps]
+    return picture_address(picture)

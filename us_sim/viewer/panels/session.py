@@ -50,12 +50,15 @@ class CasesPanel:
 
     def _draw(self, state: SessionState) -> None:
         self._list.clear()
-        cases = [each for each in self._board.scenes if each.kind == "case"]
-        scenes = [each for each in self._board.scenes if each.kind != "case"]
+        usable = [each for each in self._board.scenes if not each.problem]
+        cases, scenes, exercises = (
+            [each for each in usable if each.kind == kind] for kind in ("case", "scene", "exercise")
+        )
         with self._list:
             if not self._board.scenes and state.is_there:
                 ui.label("What there is to load is being looked up …").classes("us-quiet")
             for title, listed in (
+                ("Exercises", exercises),
                 ("Cases", cases),
                 ("Scenes", [each for each in scenes if each.tracker in BY_HAND]),
             ):
@@ -72,7 +75,7 @@ class CasesPanel:
                         self._card(each, state)
 
     def _card(self, scene: ListedScene, state: SessionState) -> None:
-        is_loaded = scene.origin == state.origin
+        is_loaded = scene.origin == state.origin.partition("#")[0]
         with ui.card().classes("us-case") as card:
             if is_loaded:
                 card.classes("us-case-loaded")
