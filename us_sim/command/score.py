@@ -26,8 +26,15 @@ def score_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "session",
         type=find_bag,
+        nargs="?",
         metavar="SESSION",
         help="a session, any bag with poses, or a recording of Plus or 3D Slicer",
+    )
+    parser.add_argument(
+        "--class",
+        dest="of_class",
+        metavar="ADDRESS",
+        help="in place of a session: one table of all results of `us-sim view --results ADDRESS`",
     )
     parser.add_argument("--topic", metavar="NAME", help="of the poses, where there are several")
     parser.add_argument("--wrench", metavar="NAME", help="topic of the force on the probe")
@@ -39,16 +46,36 @@ def score_options(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_score)
 
 
+def _require_new(out: Path | None, files: Sequence[str]) -> None:
+    taken = [out / file for file in files if (out / file).exists()] if out is not None else []
+    if taken:
+        raise ScoreError(f"{taken[0]} exists already: choose another folder with --out")
+
+
+def _score_class(args: argparse.Namespace) -> int:
+    from us_sim.scoring.class_table import CLASS_FILES, class_table, write_class
+    from us_sim.scoring.result import read_results
+
+    _require_new(args.out, CLASS_FILES)
+    table = class_table(read_results(args.of_class))
+    print(table.drop(columns=["volume", "changed", "checksum"]).to_string(index=False))
+    for file in write_class(table, args.out) if args.out is not None else []:
+        print(file)
+    return 0
+
+
 def _score(args: argparse.Namespace) -> int:
     from us_sim.evaluation.report import markdown_table
     from us_sim.run.session_score import read_scan
 
+    if (args.session is None) == (args.of_class is None):
+        raise ScoreError("name a session to score, or the results of a class with --class")
+    if args.of_class is not None:
+        return _score_class(args)
     settings = read_settings(args, ScoreSettings)
     exercise = read_exercise(args.exercise) if args.exercise is not None else None
     out: Path | None = args.out
-    taken = [out / file for file in _FILES if (out / file).exists()] if out is not None else []
-    if taken:
-        raise ScoreError(f"{taken[0]} exists already: choose another folder with --out")
+    _require_new(out, _FILES)
     scan = read_scan(args.session, args.topic, args.wrench, late_progress("score"))
     metrics = list(metrics_of(scan, settings))
     rows = [(each.name, each.text, each.unit, each.roles) for each in metrics]

@@ -1,0 +1,124 @@
+"""Results of attempts: written and read, as pages and as the table of a class."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from us_sim.errors import ScoreError
+from us_sim.scoring.class_table import class_table, write_class
+from us_sim.scoring.exercise import Step
+from us_sim.scoring.live import Score
+from us_sim.scoring.metrics import Metric
+from us_sim.scoring.result import (
+    plain_metrics,
+    read_results,
+    result_page,
+    state_of,
+    write_result,
+)
+
+
+def result(student="Ada", begun="2026-11-29T07:07:21+00:00", done=2, **more):
+    states = ["done" if k < done else "missed" for k in range(3)]
+    return {
+        "name": "Compression <of> the vein",
+        "description": "Compress the vein.",
+        "scene": "arm",
+        "state": "passed" if done == 3 else "not passed",
+        "seconds": 12.0,
+        "about": {"student": student, "begun": begun, "checksum": "abc", "changed": ""},
+        "plain": {"Time, s": "12", "Highest force, N": "9.81", "Points right, of 3": str(done)},
+        "steps": [{"what": f"point {k}", "state": s, "seen": "x"} for k, s in enumerate(states)],
+        "faults": [{"seconds": 3.5, "what": "slid"}],
+        "metrics": {"Path Length, mm": "60", "Smallest Area of vein, mm^2": "1"},
+        **more,
+    }
+
+
+def test_the_five_plain_metrics_come_first():
+    metrics = [
+        Metric("Path Length", "mm", 1234.5),
+        Metric("Peak Probe Force", "N", 9.8765),
+        Metric("Time above 20 N", "s", 0.25),
+    ]
+    score = Score(metrics, [Step("a", True, ""), Step("b", False, "")], (), 52.21)
+    assert [(each.label, each.brief) for each in plain_metrics(score, 20.0)] == [
+        ("Time, s", "52.2"),
+        ("Highest force, N", "9.88"),
+        ("Time above 20 N, s", "0.25"),
+        ("Way of the probe, mm", "1.23e+03"),
+        ("Points right, of 2", "1"),
+    ]
+    assert np.isnan(plain_metrics(Score([]), 20.0)[0].value)
+
+
+@pytest.mark.parametrize(
+    ("score", "void", "state"),
+    [
+        (Score([], was_in_air=False), "", "to lift"),
+        (Score([]), "", "to do"),
+        (Score([], [Step("a", True, "")], seconds=1.0), "", "running"),
+        (Score([], [Step("a", True, "")], seconds=1.0, has_ended=True), "", "passed"),
+        (Score([], [Step("a", False, "")], seconds=1.0, has_ended=True), "", "not passed"),
+        (Score([]), "why", "void"),
+    ],
+)
+def test_what_became_of_an_attempt(score, void, state):
+    assert state_of(score, void) == state
+
+
+def test_a_page_has_all_and_no_markup_of_a_name():
+    page = result_page(result(), b"\x89PNG")
+    assert "Compression &lt;of&gt; the vein: not passed" in page
+    assert all(word in page for word in ("9.81", "slid", "iVBORw==", "<summary>More", "Ada"))
+
+
+@given(st.text(max_size=30))
+def test_any_name_is_written_and_read_again(tmp_path_factory, student):
+    folder = tmp_path_factory.mktemp("class")
+    files = write_result(result(student), b"", str(folder))
+    assert [file.rpartition(".")[2] for file in files] == ["html", "json"]
+    assert read_results(str(folder)) == [json.loads(json.dumps(result(student)))]
+
+
+def test_results_go_to_any_address_of_fsspec():
+    fsspec = pytest.importorskip("fsspec")
+    address = "memory://class/of/1"
+    write_result(result(), b"", address)
+    write_result(result("Bob", "2026-11-29T07:00:00+00:00"), b"", address)
+    assert [each["about"]["student"] for each in read_results(address)] == ["Bob", "Ada"]
+    assert len(fsspec.filesystem("memory").ls("/class/of/1")) == 4
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"name": "x"}'])
+def test_what_is_no_result_is_refused_with_its_name(tmp_path, text):
+    (tmp_path / "other.json").write_text(text)
+    with pytest.raises(ScoreError, match=r"other\.json"):
+        read_results(str(tmp_path))
+    with pytest.raises(ScoreError, match="no result"):
+        read_results(str(tmp_path / "nowhere"))
+
+
+def test_a_place_that_cannot_be_written_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ScoreError, match="cannot be written"):
+        write_result(result(), b"", str(tmp_path / "file"))
+
+
+def test_the_table_of_a_class_has_a_row_for_each_attempt(tmp_path):
+    begun = [f"2026-11-29T07:0{k}:00+00:00" for k in range(3)]
+    results = [result("Ada", begun[0], 1), result("Bob", begun[1], 3), result("Ada", begun[2], 3)]
+    table = class_table(results)
+    csv, page = write_class(table, tmp_path / "out")
+    kept = pd.read_csv(csv)
+    assert list(kept["student"]) == ["Ada", "Bob", "Ada"]
+    assert list(kept["right"]) == [1, 3, 3]
+    assert list(kept["Highest force, N"]) == [9.81] * 3
+    text = page.read_text()
+    assert "2 students, 1 exercises, 3 attempts, 2 of them passed." in text
+    assert "Compression &lt;of&gt; the vein" in text
+    assert "data:image/png" in text
