@@ -243,7 +243,7 @@ def blind(seen, points=("compressible",) * 3, thrombus="none", **task):
     made = replace(exercise, task=replace(exercise.task, given=changed)).begin(seen.lines)
     made.add(seen)
     hidden = made.steps()
-    made.answer(points, thrombus)
+    made.answer(points, thrombus, seen.motion.times[-1])
     return hidden, made
 
 
@@ -283,10 +283,20 @@ def test_right_answers_without_an_examination_do_not_pass():
 def test_an_answer_ends_a_blind_attempt_only_when_all_are_there():
     _, made = blind(scanned(examination()), ("compressible", "", "compressible"))
     assert made.ended is None
-    made.answer(("compressible",) * 3, "none")
+    made.answer(("compressible",) * 3, "none", 20.0)
     assert [step.is_done for step in made.steps()] == [True] * 4
     with pytest.raises(ScoreError, match="ended"):
-        made.answer(("compressible",) * 3, "1")
+        made.answer(("compressible",) * 3, "1", 21.0)
+
+
+def test_what_comes_late_of_before_the_last_answer_counts():
+    seen = scanned(examination())
+    exercise = replace(read_exercise("compression"), feedback="afterwards")
+    made = exercise.begin(seen.lines)
+    made.add(until(seen, 8.0))
+    made.answer(("compressible",) * 3, "none", seen.motion.times[-1])
+    made.add(replace(seen, since=8.0))
+    assert [step.is_done for step in made.steps()] == [True] * 4
 
 
 @pytest.mark.parametrize(
@@ -299,6 +309,6 @@ def test_an_answer_that_is_none_is_refused(points, thrombus):
 
 def test_where_all_is_said_at_once_nothing_is_asked():
     with pytest.raises(ScoreError, match="asks nothing"):
-        attempt(scanned(examination())).answer(("compressible",), "")
+        attempt(scanned(examination())).answer(("compressible",), "", 0.0)
     with pytest.raises(ScoreError, match="compression"):
         replace(read_exercise("keep_force"), feedback="afterwards").begin({})

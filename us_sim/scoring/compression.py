@@ -200,7 +200,7 @@ class _Examination(Attempt):
         """Have steps say nothing that an image does not show, until the attempt has ended."""
         self._is_hidden = True
 
-    def answer(self, points: Sequence[str], thrombus: str) -> None:
+    def answer(self, points: Sequence[str], thrombus: str, time: float) -> None:
         """Take the learner's answers; the last one ends the attempt.
 
         Raises:
@@ -221,7 +221,7 @@ class _Examination(Attempt):
             point.answer = answer
         self._answer = thrombus
         if thrombus and all(point.answer for point in self._points):
-            self.ended = max(self._time, self._begin or 0.0)
+            self.ended = time
 
     def add(self, scan: Scan) -> None:
         """Take the images that are new."""
@@ -232,9 +232,9 @@ class _Examination(Attempt):
             return
         force = scan.force.at(section.times) if scan.force else np.full(len(section.times), np.nan)
         for k in np.flatnonzero(section.times > scan.since).tolist():
-            if self.ended is not None:
-                return
             time, peak = float(section.times[k]), float(force[k])
+            if self.ended is not None and time > self.ended:
+                return
             if scan.force is not None:
                 times = scan.force.times
                 between = scan.force.newtons[(times > self._time) & (times <= time)]

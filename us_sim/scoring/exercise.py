@@ -84,12 +84,13 @@ class Attempt(ABC):
         """
         raise ScoreError("feedback: afterwards: is for a compression, which has questions")
 
-    def answer(self, points: Sequence[str], thrombus: str) -> None:  # noqa: ARG002
+    def answer(self, points: Sequence[str], thrombus: str, time: float) -> None:  # noqa: ARG002
         """Take the learner's answers so far.
 
         Args:
             points: one for each point, of `ANSWERS`; "" for none yet.
             thrombus: number of a point at it, "none", or "" for no answer yet.
+            time: s, when they were given.
 
         Raises:
             ScoreError: nothing is asked, or an answer will not do.
@@ -145,9 +146,9 @@ class TimedAttempt(Attempt):
         """Have steps say nothing that an image does not show, until the attempt has ended."""
         self._attempt.hide_truth()
 
-    def answer(self, points: Sequence[str], thrombus: str) -> None:
+    def answer(self, points: Sequence[str], thrombus: str, time: float) -> None:
         """Take the learner's answers so far."""
-        self._attempt.answer(points, thrombus)
+        self._attempt.answer(points, thrombus, time)
         self.ended = self._attempt.ended
 
     def seconds(self) -> float | None:

@@ -100,7 +100,7 @@ class LiveScan:
         """
         if self._attempt is None:
             raise ScoreError("answers: no exercise is followed")
-        self._attempt.answer(points, thrombus)
+        self._attempt.answer(points, thrombus, self._pose_times[-1] if self._pose_times else 0.0)
 
     def _is_next(self, times: list[float], time: float) -> bool:
         return time > self._settled and not (times and time <= times[-1])
