@@ -1,6 +1,7 @@
 """The command `score`: sessions whose values are known, its files, and what is left out."""
 
 import csv
+import json
 
 import numpy as np
 import pytest
@@ -129,3 +130,16 @@ def test_a_centred_vein_is_held(squashed, tmp_path, capsys):
     file.write_text("name: c\ntask: {kind: centre, structure: aorta}\n")
     assert main(["score", str(squashed), "--exercise", str(file)]) == 1
     assert "aorta" in capsys.readouterr().err
+
+
+def test_the_results_of_a_class_are_one_table(tmp_path, capsys):
+    about = {"student": "Ada", "begun": "2026-11-29T07:00:00+00:00"}
+    result = {"name": "Press", "state": "passed", "about": about, "steps": [], "faults": []}
+    (tmp_path / "a.json").write_text(json.dumps({**result, "plain": {"Time, s": "12"}}))
+    assert main(["score", "--class", str(tmp_path), "--out", str(tmp_path / "out")]) == 0
+    assert "Ada" in capsys.readouterr().out
+    assert "Press" in (tmp_path / "out" / "class.csv").read_text()
+    assert main(["score", "--class", str(tmp_path), "--out", str(tmp_path / "out")]) == 1
+    assert "exists already" in capsys.readouterr().err
+    assert main(["score"]) == 1
+    assert "--class" in capsys.readouterr().err

@@ -311,4 +311,4 @@ def test_where_all_is_said_at_once_nothing_is_asked():
     with pytest.raises(ScoreError, match="asks nothing"):
         attempt(scanned(examination())).answer(("compressible",), "", 0.0)
     with pytest.raises(ScoreError, match="compression"):
-        replace(read_exercise("keep_force"), feedback="afterwards").begin({})
+        replace(read_exercise("keep_force"), feedback="afterwards")

@@ -326,7 +326,7 @@ def _exercise_document(name: str) -> tuple[Any, list[Path], str]:
         raise SceneError(f"{origin}: scene: is missing; name the one that it is done in")
     document, folders = read_document(find_scene(exercise.scene), find_scene)
     more: dict[Any, Any] = {"name": Path(exercise.origin).stem, "exercise": exercise.origin}
-    more["description"] = exercise.description
+    more["description"] = exercise.description or exercise.name
     if exercise.seeds is not None:
         low, high = exercise.seeds
         seed = int(given) if given.isdecimal() else random.randint(low, high)

@@ -45,6 +45,8 @@ class Compression(Task):
     thrombosis", Circulation 137 (2018).
     """
 
+    asks = True
+
     structure: str = setting(description="vein to be compressed", default="vein")
     artery: str | None = setting(description="artery that must stay open", default=None)
     points: tuple[float, ...] | int | None = setting(
@@ -188,17 +190,11 @@ class _Examination(Attempt):
         self._open: tuple[float, float] | None = None  # s since when, and m where it is seen open
         self._was_lifted = True  # since the last press
         self._along = np.nan  # m, of the last image
-        self._time = -np.inf  # s, likewise
+        self._looked = -np.inf  # s, likewise
         self._is_over = False  # whether the force is over its limit
-        self._begin: float | None = None  # s, of the first touch
         self._thrombus = np.inf, -np.inf  # m, from and to
         self._faults: list[Fault] = []
-        self._is_hidden = False  # the truth
         self._answer = ""  # where the thrombus is: a point's number, or that there is none
-
-    def hide_truth(self) -> None:
-        """Have steps say nothing that an image does not show, until the attempt has ended."""
-        self._is_hidden = True
 
     def answer(self, points: Sequence[str], thrombus: str, time: float) -> None:
         """Take the learner's answers; the last one ends the attempt.
@@ -207,8 +203,8 @@ class _Examination(Attempt):
             ScoreError: nothing is asked, it has ended, or an answer will not do.
         """
         numbers = [str(k + 1) for k in range(len(self._points))]
-        if not self._is_hidden:
-            raise ScoreError("answers: this exercise says at once what is right, and asks nothing")
+        if not self.is_blind:
+            super().answer(points, thrombus, time)
         if self.ended is not None:
             raise ScoreError("answers: the attempt has ended: begin anew")
         if len(points) > len(numbers) or not {*points} <= {*ANSWERS, ""}:
@@ -223,7 +219,7 @@ class _Examination(Attempt):
         if thrombus and all(point.answer for point in self._points):
             self.ended = time
 
-    def add(self, scan: Scan) -> None:
+    def take(self, scan: Scan) -> None:
         """Take the images that are new."""
         task = self._task
         self._thrombus = scan.thrombi.get(task.structure, self._thrombus)
@@ -237,10 +233,10 @@ class _Examination(Attempt):
                 return
             if scan.force is not None:
                 times = scan.force.times
-                between = scan.force.newtons[(times > self._time) & (times <= time)]
+                between = scan.force.newtons[(times > self._looked) & (times <= time)]
                 peak = float(between.max(initial=np.nan_to_num(peak)))
             open_artery = float(artery.fraction[k]) if artery is not None else np.nan
-            self._take(
+            self._look(
                 _Look(
                     time,
                     float(section.along[k]),
@@ -250,7 +246,7 @@ class _Examination(Attempt):
                     open_artery if np.isfinite(open_artery) else 1.0,
                 )
             )
-            self._time = time
+            self._looked = time
 
     def steps(self) -> list[Step]:
         """Return one step for each point, and one for the time if it is limited."""
@@ -258,14 +254,14 @@ class _Examination(Attempt):
         steps = []
         for number, point in enumerate(self._points, 1):
             what = f"{number}: {self._task.structure} at {_MM * point.at:.0f} mm"
-            if self._is_hidden:
+            if self.is_blind:
                 steps.append(self._hidden_step(f"point {number}", point))
                 continue
             seen = self._tell_press() if point is pressed and not point.is_done else point.seen
             is_here = abs(self._along - point.at) <= self._task.tolerance
             is_missed = point.is_tried and not point.is_done and not is_here
             steps.append(Step(what, point.is_done, seen, point.place[None], is_missed=is_missed))
-        if self._is_hidden:
+        if self.is_blind:
             steps.append(self._thrombus_step())
         return [*steps, *self._steps_of_time()]
 
@@ -310,19 +306,14 @@ class _Examination(Attempt):
         limit = self._task.time_limit
         if limit is None:
             return []
-        seconds = self._seconds(self._time if self.ended is None else self.ended)
+        seconds = self.seconds() or 0.0
         is_kept = seconds <= limit
         return [Step(f"within {limit:g} s", is_kept, f"{seconds:.0f} s", is_missed=not is_kept)]
 
-    def _seconds(self, now: float) -> float:
-        """Return the time since the first touch."""
-        return 0.0 if self._begin is None else now - self._begin
-
-    def _take(self, look: _Look) -> None:
+    def _look(self, look: _Look) -> None:
         task = self._task
-        if look.touches and self._begin is None:
-            self._begin = look.time
-        if task.time_limit and (self._seconds(look.time) > task.time_limit):
+        begun = look.time if self.touched is None else self.touched
+        if task.time_limit is not None and look.time - begun > task.time_limit:
             self.ended = look.time
             return
         self._along = look.along if np.isfinite(look.along) else self._along
@@ -337,7 +328,7 @@ class _Examination(Attempt):
         if self._press is not None and not presses:
             self._finish(self._press)
         self._see_open(look)
-        if not self._is_hidden and all(point.is_done for point in self._points):
+        if not self.is_blind and all(point.is_done for point in self._points):
             self.ended = look.time
 
     def _see_open(self, look: _Look) -> None:
@@ -356,7 +347,7 @@ class _Examination(Attempt):
         if self._open is not None:
             since, along = self._open
             is_there = abs(look.along - along) <= self._task.tolerance
-            if is_there and self._time - since >= _LOOKED:
+            if is_there and self._looked - since >= _LOOKED:
                 return ""
         return "pressed before the vein was seen open there: touch lightly first"
 

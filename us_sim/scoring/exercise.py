@@ -59,14 +59,41 @@ class Fault(NamedTuple):
 
 
 class Attempt(ABC):
-    """An attempt at a task: a scan is added to it whole, or in pieces one after another."""
+    """An attempt at a task: a scan is added to it whole, or in pieces one after another.
 
+    It begins when the probe is in the air for the first time: a scene may be loaded, or an attempt
+    begun anew, under a probe that presses already. A scan without force begins at once, since
+    nobody knows when it touches.
+    """
+
+    was_in_air = False
+    is_blind = False
+    """Whether steps say nothing that an image does not show, until the attempt has ended."""
+    touched: float | None = None
+    """s since the first pose, when the probe touched the skin for the first time."""
     ended: float | None = None
-    """s since the first pose, when all was done or the time was over; None before."""
+    """s, when all was done or the time was over; None before."""
+    _time = 0.0  # s, of the last pose
+
+    def add(self, scan: Scan) -> None:
+        """Take the samples that are new, from the first in the air on."""
+        times, is_touching = scan.motion.times, np.True_
+        if scan.force is not None:
+            times, is_touching = scan.force.times, scan.force.newtons >= IN_AIR
+            in_air = times[(times > scan.since) & ~is_touching]
+            if not self.was_in_air:
+                if not len(in_air):
+                    return
+                scan = replace(scan, since=float(np.nextafter(in_air[0], -np.inf)))
+        self.was_in_air, self._time = True, float(scan.motion.times[-1])
+        if self.touched is None:
+            touching = times[(times > scan.since) & is_touching]
+            self.touched = float(touching[0]) if len(touching) else None
+        self.take(scan)
 
     @abstractmethod
-    def add(self, scan: Scan) -> None:
-        """Take the samples that are new."""
+    def take(self, scan: Scan) -> None:
+        """Take the samples that are new and count."""
 
     @abstractmethod
     def steps(self) -> list[Step]:
@@ -75,14 +102,6 @@ class Attempt(ABC):
     def faults(self) -> list[Fault]:
         """Return what was done wrong, in order."""
         return []
-
-    def hide_truth(self) -> None:
-        """Have steps say nothing that an image does not show, until the attempt has ended.
-
-        Raises:
-            ScoreError: the task has no questions that could be answered then.
-        """
-        raise ScoreError("feedback: afterwards: is for a compression, which has questions")
 
     def answer(self, points: Sequence[str], thrombus: str, time: float) -> None:  # noqa: ARG002
         """Take the learner's answers so far.
@@ -97,65 +116,11 @@ class Attempt(ABC):
         """
         raise ScoreError("answers: this exercise asks nothing")
 
-
-class TimedAttempt(Attempt):
-    """An attempt that begins when the probe is in the air for the first time.
-
-    A scene may be loaded, or an attempt begun anew, under a probe that presses already. A scan
-    without force begins at once, since nobody knows when it touches.
-
-    Args:
-        attempt: at the task.
-    """
-
-    def __init__(self, attempt: Attempt) -> None:
-        self._attempt = attempt
-        self.was_in_air = False
-        self._touched: float | None = None  # s
-        self._time = 0.0  # s, of the last pose
-
-    def add(self, scan: Scan) -> None:
-        """Take the samples that are new, from the first in the air on."""
-        if scan.force is not None and not self.was_in_air:
-            new = scan.force.times > scan.since
-            in_air = scan.force.times[new & (scan.force.newtons < IN_AIR)]
-            if not len(in_air):
-                return
-            since = float(np.nextafter(in_air[0], -np.inf))
-            scan = replace(scan, since=max(scan.since, since))
-            self.was_in_air = True
-        self._time = float(scan.motion.times[-1])
-        if self._touched is None:
-            times = scan.motion.times
-            if scan.force is not None:
-                times = scan.force.times[scan.force.newtons >= IN_AIR]
-            new_times = times[times > scan.since]
-            self._touched = float(new_times[0]) if len(new_times) else None
-        self._attempt.add(scan)
-        self.ended = self._attempt.ended
-
-    def steps(self) -> list[Step]:
-        """Return every thing that is to be done."""
-        return self._attempt.steps()
-
-    def faults(self) -> list[Fault]:
-        """Return what was done wrong, in order."""
-        return self._attempt.faults()
-
-    def hide_truth(self) -> None:
-        """Have steps say nothing that an image does not show, until the attempt has ended."""
-        self._attempt.hide_truth()
-
-    def answer(self, points: Sequence[str], thrombus: str, time: float) -> None:
-        """Take the learner's answers so far."""
-        self._attempt.answer(points, thrombus, time)
-        self.ended = self._attempt.ended
-
     def seconds(self) -> float | None:
         """Return the time from the first touch to the end, or so far; None before the first."""
-        if self._touched is None:
+        if self.touched is None:
             return None
-        return (self._time if self.ended is None else self.ended) - self._touched
+        return (self._time if self.ended is None else self.ended) - self.touched
 
 
 class Task(Settings):
@@ -163,6 +128,8 @@ class Task(Settings):
 
     error: ClassVar = ScoreError
     section: ClassVar = "task"
+    asks: ClassVar[bool] = False
+    """Whether it has questions that a learner can answer, where nothing is told."""
 
     @property
     def structures(self) -> tuple[str, ...]:
@@ -221,7 +188,7 @@ class _KeptForce(Attempt):
         self._task, self._hold = task, _Hold(task.duration)
         self._newtons: float | None = None  # the last
 
-    def add(self, scan: Scan) -> None:
+    def take(self, scan: Scan) -> None:
         if scan.force is not None:
             new = scan.force.times > scan.since
             within = np.abs(scan.force.newtons - self._task.force) <= self._task.tolerance
@@ -261,7 +228,7 @@ class _Centred(Attempt):
         self._task, self._line, self._is_seen = task, line, False
         self._hold = _Hold(task.duration)
 
-    def add(self, scan: Scan) -> None:
+    def take(self, scan: Scan) -> None:
         section = scan.sections.get(self._task.structure)
         if section is not None:
             new = section.times > scan.since
@@ -306,7 +273,7 @@ class _Followed(Attempt):
         self._seen = np.zeros(len(self._pieces), bool)
         self._last: float | None = None  # m along the vessel, where it was centred just before
 
-    def add(self, scan: Scan) -> None:
+    def take(self, scan: Scan) -> None:
         section = scan.sections.get(self._task.structure)
         if section is None:
             return
@@ -358,7 +325,7 @@ class _Found(Attempt):
         self._task, self._hold = task, _Hold(task.duration)
         self._nearest = np.inf, np.inf, np.inf  # how far in all, m, rad
 
-    def add(self, scan: Scan) -> None:
+    def take(self, scan: Scan) -> None:
         task, wanted = self._task, self._task.pose.pose
         new = scan.motion.times > scan.since
         times = scan.motion.times[new]
@@ -420,12 +387,17 @@ class Exercise(Settings):
     origin: str = ""  # its file
     checksum: str = ""  # of that file: the first 12 digits of its SHA-256
 
+    def check(self) -> None:
+        """Refuse to ask where there is no question."""
+        if self.feedback == "afterwards" and not self.assigned.asks:
+            raise self.refused("feedback", "afterwards is for a compression, which has questions")
+
     @property
     def assigned(self) -> Any:
         """The task with its settings."""
         return self.task.settings(EXERCISES)
 
-    def begin(self, lines: Mapping[str, CentreLine]) -> TimedAttempt:
+    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:
         """Return an attempt at it, in a scene with these vessels.
 
         Raises:
@@ -436,9 +408,8 @@ class Exercise(Settings):
                 known = unknown(name, lines) if lines else f"{name!r} is not known"
                 of = "the vessels of the scene" if lines else "a scan without a scene"
                 raise ScoreError(f"exercise {self.name}: in {of} the structure {known}")
-        attempt = TimedAttempt(self.assigned.begin(lines))
-        if self.feedback == "afterwards":
-            attempt.hide_truth()
+        attempt: Attempt = self.assigned.begin(lines)
+        attempt.is_blind = self.feedback == "afterwards"
         return attempt
 
     def steps(self, scan: Scan) -> list[Step]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import ScoreError
 from us_sim.geometry.pose import Pose
-from us_sim.scoring.exercise import Exercise, Fault, Step, TimedAttempt
+from us_sim.scoring.exercise import Attempt, Exercise, Fault, Step
 from us_sim.scoring.lumen import LumenMeter, lumens_of, vessels_in
 from us_sim.scoring.metrics import Force, Metric, Scan, Tally
 from us_sim.scoring.motion import Motion
@@ -182,7 +182,7 @@ def _span(times: list[float], since: float, until: float, before: int) -> tuple[
     return max(bisect_right(times, since) - before, 0), bisect_right(times, until)
 
 
-def _add(tally: Tally, attempt: TimedAttempt | None, scan: Scan) -> None:
+def _add(tally: Tally, attempt: Attempt | None, scan: Scan) -> None:
     tally.add(scan)
     if attempt is not None:
         attempt.add(scan)
