@@ -77,6 +77,33 @@ def test_task_steps_and_score_are_shown_begun_anew_and_saved(page, simulator):
     until(lambda: not scorer.picture.is_watched, "another tab is chosen")
 
 
+def test_a_blind_exercise_hides_the_truth_and_asks(page, simulator):
+    scorer, asked = Scorer(simulator), []
+
+    async def answer(name, value):
+        asked.append((name, value))
+        return ""
+
+    simulator.nodes.of("scorer").set = answer
+    steps = [
+        {**step, "what": what} for step, what in zip(STEPS, ("point 1", "thrombus"), strict=True)
+    ]
+    page.goto(page.address)
+    page.locator("#us-panels").click()
+    page.get_by_role("tab", name="Exercise").click()
+    until(lambda: scorer.picture.is_watched, "the panel is seen")
+    scorer.say([{**step, "state": "to do"} for step in steps], feedback="afterwards")
+    page.get_by_role("button", name="point 1: not compressible").click()
+    page.get_by_role("button", name="thrombus: 1", exact=True).click()
+    until(lambda: len(asked) == 2, "it is answered")
+    assert asked == [("answers", ["not compressible"]), ("thrombus", "1")]
+    page.get_by_role("tab", name="Tissue").wait_for(state="hidden")
+    page.get_by_role("button", name="Outlines").wait_for(state="hidden")
+    scorer.say([{**step, "state": "done"} for step in steps], feedback="afterwards")
+    page.get_by_role("tab", name="Tissue").wait_for()
+    page.get_by_role("button", name="Outlines").wait_for()
+
+
 @pytest.fixture
 def heard(bench: Bench):
     """The simulator that a node fills."""
