@@ -92,7 +92,7 @@ def test_a_blind_exercise_hides_the_truth_and_asks(page, simulator):
     page.locator("#us-panels").click()
     page.get_by_role("tab", name="Exercise").click()
     until(lambda: scorer.picture.is_watched, "the panel is seen")
-    scorer.say([{**step, "state": "to do"} for step in steps], feedback="afterwards")
+    scorer.say(steps, feedback="afterwards")
     page.get_by_role("button", name="point 1: not compressible").click()
     page.get_by_role("button", name="thrombus: 1", exact=True).click()
     until(lambda: len(asked) == 2, "it is answered")
