@@ -195,12 +195,12 @@ def read_camera_info(path: Path | str) -> CameraModel:
         if key not in content:
             raise TrackingError(f"{path}: {key} is missing; camera info has {', '.join(wanted)}")
     model = content.get("distortion_model", "plumb_bob")
-    sizes = [content[key] for key in wanted[:2]]
+    width, height = sizes = [content[key] for key in wanted[:2]]
     if not all(isinstance(size, int) and not isinstance(size, bool) for size in sizes):
         raise TrackingError(f"{path}: image_width and image_height must be whole, not {sizes}")
     try:
         matrix, distortion = (_data(content, key) for key in wanted[2:])
-        return CameraModel(*sizes, matrix, distortion, model)
+        return CameraModel(width, height, matrix, distortion, model)
     except TrackingError as error:
         raise TrackingError(f"{path}: {error}") from error
 
