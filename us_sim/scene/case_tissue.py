@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.cache import Form, kept
+from us_sim.cache import kept
 from us_sim.geometry.collider import Capsule, Collider, Sphere
 from us_sim.geometry.pose import Placement, Pose
 from us_sim.geometry.transducer import ProbeSettings
@@ -201,7 +201,7 @@ def box_tissue(scene: Scene, volume: Volume) -> tuple[TetrahedralMesh, LabelFrac
 
     if scene.volume.case is None:
         return make()
-    return kept(_key(scene), Form("tissue.json", _pack, _unpack), make)
+    return kept(_key(scene), _pack, _unpack, make)
 
 
 def _pack(

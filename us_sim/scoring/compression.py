@@ -373,9 +373,9 @@ class _Examination(Attempt):
         """Return the point that the press is at."""
         if self._press is None:
             return None
-        nearest = min(self._points, key=lambda point: abs(point.at - self._press.along))
-        is_there = abs(nearest.at - self._press.along) <= self._task.tolerance
-        return nearest if is_there else None
+        along = self._press.along
+        nearest = min(self._points, key=lambda point: abs(point.at - along))
+        return nearest if abs(nearest.at - along) <= self._task.tolerance else None
 
     def _finish(self, press: _Press) -> None:
         """Have the point that the press was at know what became of it."""

@@ -77,7 +77,7 @@ class Attempt(ABC):
 
     def add(self, scan: Scan) -> None:
         """Take the samples that are new, from the first in the air on."""
-        times, is_touching = scan.motion.times, np.True_
+        times, is_touching = scan.motion.times, np.ones(len(scan.motion), bool)
         if scan.force is not None:
             times, is_touching = scan.force.times, scan.force.newtons >= IN_AIR
             in_air = times[(times > scan.since) & ~is_touching]
