@@ -140,7 +140,7 @@ def test_a_camera_that_comes_and_goes_is_waited_for(bench, monkeypatch, calibrat
     ("bad", "fact"),
     [
         ({"source": "nothing.avi"}, "no such file"),
-        ({"source": "{pipe}"}, "neither a file"),
+        ({"source": "{pipe}"}, "no such file"),
         ({"source": "0", "encoding": "yuv"}, "encoding: 'yuv' .*mono8, bgr8"),
         ({"source": "0", "camera_info": "{text}"}, "camera info"),
     ],

@@ -7,6 +7,7 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
+from rosbags.interfaces import QosDurability, QosReliability
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
@@ -40,8 +41,8 @@ def test_what_is_published_is_recorded_as_it_was(bench, tmp_path):
     assert [deserialize_message(bytes(m.data), PoseStamped) for m in messages] == sent
     assert {len(m.data) for m in messages} == {len(serialize_message(sent[0]))}
     assert bag.topic("/early").message_count == 1
-    assert bag.topic("/early").qos[0].durability == "transient_local"
-    assert bag.topic("/ultrasound/image").qos[0].reliability == "best_effort"
+    assert bag.topic("/early").qos[0].durability == QosDurability.TRANSIENT_LOCAL
+    assert bag.topic("/ultrasound/image").qos[0].reliability == QosReliability.BEST_EFFORT
     for message in bag.messages():
         assert message.publish_time <= message.log_time
 
