@@ -194,7 +194,6 @@ def test_a_wrench_written_by_hand_is_the_message(frame):
 
 
 def run(thread, done):
-    thread.start()
     assert done.wait(20.0)
     thread.stop()
 

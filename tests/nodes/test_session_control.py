@@ -31,7 +31,9 @@ class Simulation:
 def controlled(bench):
     simulation = Simulation()
     settings = SessionControlSettings(scene="arm", volume="arm.nrrd")
-    control = bench.add(SessionControl(simulation, settings, context=bench.context))
+    control = bench.add(
+        SessionControl(simulation.check, simulation.take, settings, context=bench.context)
+    )
     return control, simulation
 
 

@@ -11,6 +11,7 @@ from builtin_interfaces.msg import Time as TimeMessage
 from numpy.typing import NDArray
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
 
 from us_sim.errors import TrackingError
 from us_sim.nodes.guarded_node import GuardedNode, Health
@@ -170,9 +171,7 @@ class CameraDriver(GuardedNode):
 def _info(
     camera: CameraModel | None, size: tuple[int, int], stamp: TimeMessage, frame: str
 ) -> CameraInfo:
-    message = CameraInfo()
-    message.header.stamp = stamp
-    message.header.frame_id = frame
+    message = CameraInfo(header=Header(stamp=stamp, frame_id=frame))
     message.width, message.height = size
     if camera is not None:
         message.width, message.height = camera.width, camera.height

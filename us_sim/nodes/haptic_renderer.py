@@ -25,7 +25,7 @@ _MEASURED = 2000  # ticks of which the jitter is told
 
 
 class PeriodicThread:
-    """Calls ``work`` at absolute times one period apart; those that have passed are skipped.
+    """Calls ``work`` at absolute times one period apart, from now on; skips those that have passed.
 
     Args:
         rate: Hz.
@@ -39,16 +39,12 @@ class PeriodicThread:
         self._late: deque[int] = deque(maxlen=_MEASURED)  # ns
         self.skipped = 0
         self._thread = threading.Thread(target=self._run, name="periodic", daemon=True)
-
-    def start(self) -> None:
-        """Begin."""
         self._thread.start()
 
     def stop(self) -> None:
         """End after the present tick."""
         self._ending.set()
-        if self._thread.is_alive():
-            self._thread.join()
+        self._thread.join()
 
     @property
     def jitter(self) -> float:
@@ -96,13 +92,12 @@ class HapticRenderer(SceneNode):
         self._stops = 0
         self._wrenches = self.stream(WrenchStamped, "haptic/wrench")
         self.subscribe(PoseStamped, "haptic/pose", self._on_pose, FOREIGN)
-        self.subscribe(Bool, "haptic/clutch", self._on_clutch, FOREIGN)
+        self.subscribe(Bool, "haptic/clutch", lambda m: self._rendering.clutch(m.data), FOREIGN)
         self.subscribe(Float64MultiArray, "tissue/contact_model", self._on_model)
-        self._thread = PeriodicThread(settings.rate, self.guarded("rendering", self._render))
         self.health.measure = self._measure  # once a report: the jitter takes two ticks
         self._check_doubt()
         self.create_timer(1.0 / CHECKS, self._check_doubt)
-        self._thread.start()
+        self._thread = PeriodicThread(settings.rate, self.guarded("rendering", self._render))
 
     def destroy_node(self) -> None:
         """End with a zero wrench."""
@@ -115,9 +110,6 @@ class HapticRenderer(SceneNode):
         if stamp == 0:
             raise StampError("there is no stamp: let the arm's driver set it")
         self._rendering.pose(stamp, pose, time.monotonic_ns())
-
-    def _on_clutch(self, message: Bool) -> None:
-        self._rendering.clutch(message.data)
 
     def _on_model(self, message: Float64MultiArray) -> None:
         self._rendering.model(contact_model_from(message), time.monotonic_ns())

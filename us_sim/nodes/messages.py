@@ -157,13 +157,9 @@ def tetrahedra_message(tetrahedra: NDArray[np.integer]) -> Int32MultiArray:
 def mesh_message(vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> Mesh:
     """(N, 3) m and (T, 3) as a shape."""
     return Mesh(
-        vertices=_points(vertices),
+        vertices=[Point(x=x, y=y, z=z) for x, y, z in vertices.tolist()],
         triangles=[MeshTriangle(vertex_indices=triple.astype(np.uint32)) for triple in triangles],
     )
-
-
-def _points(vertices: NDArray[np.floating]) -> list[Point]:
-    return [Point(x=x, y=y, z=z) for x, y, z in vertices.tolist()]
 
 
 def image_message(

@@ -143,7 +143,8 @@ class PathPlayer(Player):
         if self.settings.paused:
             self.hold()
             return False
-        while not self._is_over and self._is_due:
+        due = self.head.position(self.now) + 0.5 * self._step
+        while not self._is_over and self._ages[self._next] <= due:
             self._send(self._next)
             self._next += 1
         return self._is_over
@@ -159,10 +160,6 @@ class PathPlayer(Player):
     @property
     def _is_over(self) -> bool:
         return self._next >= self.pose_count
-
-    @property
-    def _is_due(self) -> bool:
-        return bool(self._ages[self._next] <= self.head.position(self.now) + 0.5 * self._step)
 
     def _on_image(self, image: Image) -> None:
         stamp = nanoseconds_of(image.header.stamp)

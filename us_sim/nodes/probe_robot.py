@@ -19,10 +19,7 @@ from us_sim.tracking.robot import Robot, RobotSettings
 
 
 class ProbeRobot(GuardedNode):
-    """``robot/twist`` and ``robot/force`` in, ``tracker/pose`` out; it feels ``probe/wrench``.
-
-    Its parameters are those of `RobotSettings`.
-    """
+    """``robot/twist`` and ``robot/force`` in, ``tracker/pose`` out; it feels ``probe/wrench``."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("probe_robot", **kwargs)

@@ -147,16 +147,13 @@ class ProbeTracker(Device):
             transform = transform_message(probe.pose, stamp, PATIENT, "probe")
             self._transforms.publish(TFMessage(transforms=[transform]))
             self.health.published("tf")
-        self._report(probe)
-        self._check()
-
-    def _report(self, probe: Measurement) -> None:
         deviation = probe.position_deviation
         self.health.values |= {
             "filter_lag_ms": f"{1e3 * self._tracking.filter.lag:.1f}",
             **({"fit_error": f"{probe.error:.3g}"} if probe.error is not None else {}),
             **({"deviation_mm": f"{1e3 * deviation:.3f}"} if deviation is not None else {}),
         }
+        self._check()
 
     def _check(self) -> None:
         """Say so when the state has changed."""

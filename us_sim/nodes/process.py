@@ -75,13 +75,9 @@ _ENDINGS = (signal.SIGINT, signal.SIGTERM)
 _told_to_end = threading.Event()
 """An exception of a handler is lost where it meets a destructor or a compiler's callback."""
 
-_signals_wait = threading.Event()
-"""From then on a signal waits for the callback's end: no message or solver is left halfway."""
-
-
-def let_signals_wait() -> None:
-    """Have a signal to end wait until the node is made, which must not take long from here."""
-    _signals_wait.set()
+signals_wait = threading.Event()
+"""From then on a signal waits for the callback's end: no message or solver is left halfway. Who
+sets it while a node is made must not take long from there."""
 
 
 def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
@@ -107,7 +103,7 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
         gc.freeze()  # what a node is made of stays; to look through it takes a tenth of a second
         gc.enable()
         inspect.getframeinfo(sys._getframe())  # as rclpy does with each log; the first takes 40 ms
-        _signals_wait.set()
+        signals_wait.set()
         executor = create_executor(node)
         if priority := getattr(node, "realtime_priority", 0):
             node.health.scheduling = go_first(priority)
@@ -129,9 +125,10 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
         with contextlib.suppress(Exception):  # rclpy's signal thread may be doing the same
             rclpy.try_shutdown()
     finished = getattr(node, "finished", None)
-    if finished is not None and finished.done() and finished.exception() is not None:
-        return _refused(finished.exception())
-    return _interrupted(node)
+    if node is None or (finished is not None and not finished.done()):
+        return INTERRUPTED
+    problem = finished.exception() if finished is not None else None
+    return _refused(problem) if problem is not None else 0
 
 
 def node_main(create: Callable[[], Node], module: str) -> Callable[..., int]:
@@ -185,17 +182,12 @@ def spin(node: Node, executor: Executor) -> None:
         executor.remove_node(node)
 
 
-def _interrupted(node: Any) -> int:
-    finished = getattr(node, "finished", None)
-    return 0 if node is not None and (finished is None or finished.done()) else INTERRUPTED
-
-
 def _interrupt_once(*_: object) -> None:
     """End the node; a second signal, such as launch's after the terminal's, must not disturb it."""
     for number in _ENDINGS:
         signal.signal(number, lambda *_: None)
     _told_to_end.set()
-    if _signals_wait.is_set():
+    if signals_wait.is_set():
         return
     sys.unraisablehook = lambda _: None  # a compiler's callback has nobody to pass this on to
     raise KeyboardInterrupt

@@ -13,10 +13,7 @@ from us_sim.scene.scene import Scene
 
 
 class SceneNode(GuardedNode):
-    """A node that works on a scene.
-
-    Its parameters are those of `SceneNodeSettings`.
-    """
+    """A node that works on a scene."""
 
     live_priority = COMPUTING
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cache, partial
-from typing import Any, Protocol
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
+from std_msgs.msg import Header
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.guarded_node import GuardedNode, Health
@@ -22,14 +23,8 @@ _FLOWING = ("position", "fraction", "record_seconds", "record_bytes", "record_ro
 """Values that change all the time, and are published once a second."""
 
 
-class Controlled(Protocol):
-    """The simulation that follows the parameters."""
-
-    def check(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
-        """Raise UsSimError when this cannot be; ``named`` are the parameters that were set."""
-
-    def take(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
-        """Begin to do this; parameters that were not set stay in force."""
+Use = Callable[[SessionControlSettings, Collection[str]], None]
+"""Called with what is wanted and the names of the parameters that were set."""
 
 
 class SessionControl(GuardedNode):
@@ -39,15 +34,16 @@ class SessionControl(GuardedNode):
     report on ``diagnostics``: `state`, and `fraction` while something is loaded.
 
     Args:
-        controlled: does as the parameters say.
+        check: raises a UsSimError where that cannot be.
+        take: begins to do that; parameters that were not set stay in force.
         settings: that it follows now.
     """
 
     def __init__(
-        self, controlled: Controlled, settings: SessionControlSettings, **kwargs: Any
+        self, check: Use, take: Use, settings: SessionControlSettings, **kwargs: Any
     ) -> None:
         super().__init__("session_control", **kwargs)
-        self._controlled = controlled
+        self._check_wanted, self._take_wanted = check, take
         self.values = declared(self, SessionControlSettings())  # present ones of the parameters
         self._is_showing = False
         self._told: tuple[object, ...] = ()
@@ -96,7 +92,7 @@ class SessionControl(GuardedNode):
 
     def tell_scenes(self, scenes: Sequence[ListedScene]) -> None:
         """Publish which scenes and cases can be loaded."""
-        message = self._array()
+        message = DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()))
         for scene in scenes:
             status = DiagnosticStatus(
                 name=scene.name,
@@ -117,17 +113,12 @@ class SessionControl(GuardedNode):
 
     def tell_bags(self, bags: Mapping[str, str]) -> None:
         """Publish which bags can be played: files by name."""
-        message = self._array()
+        message = DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()))
         message.status = [
             DiagnosticStatus(name=name, hardware_id=file, message="bag")
             for name, file in bags.items()
         ]
         self._bags.publish(message)
-
-    def _array(self) -> DiagnosticArray:
-        message = DiagnosticArray()
-        message.header.stamp = self.get_clock().now().to_msg()
-        return message
 
     def _wanted(self, parameters: list[Parameter]) -> SessionControlSettings:
         """A volume belongs to the scene that it was set with."""
@@ -142,7 +133,7 @@ class SessionControl(GuardedNode):
             return SetParametersResult(successful=True)
         try:
             wanted = self._wanted(parameters)
-            self._controlled.check(wanted, {each.name for each in parameters})
+            self._check_wanted(wanted, {each.name for each in parameters})
         except UsSimError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -153,4 +144,4 @@ class SessionControl(GuardedNode):
             return
         self.values = self._wanted(parameters)
         self.show(self.values)
-        self._controlled.take(self.values, {each.name for each in parameters})
+        self._take_wanted(self.values, {each.name for each in parameters})

@@ -25,10 +25,7 @@ _SHOWN = 100_000_000
 
 
 class SessionPlayer(Player):
-    """Every topic of a bag, its bytes and stamps untouched, in the recorded order and pace.
-
-    Its parameters are those of `SessionPlayerSettings`.
-    """
+    """Every topic of a bag, its bytes and stamps untouched, in the recorded order and pace."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("session_player", SessionPlayerSettings(), **kwargs)

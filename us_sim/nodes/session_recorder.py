@@ -19,7 +19,7 @@ from rosbags.interfaces import Qos
 from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import LiveSettings
-from us_sim.nodes.process import let_receivers_go_first, let_signals_wait, node_main
+from us_sim.nodes.process import let_receivers_go_first, node_main, signals_wait
 from us_sim.nodes.sessions.attachments import session_attachments
 from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
 from us_sim.nodes.settings import SessionRecorderSettings
@@ -244,7 +244,7 @@ def _load_types() -> None:
 
 
 def _create() -> SessionRecorder:
-    let_signals_wait()  # a file that is begun gets its end
+    signals_wait.set()  # a file that is begun gets its end
     node = SessionRecorder()
     let_receivers_go_first()
     return node

@@ -64,7 +64,6 @@ PLAYERS = ("path_player", "session_player")
 """Nodes that play what was recorded."""
 _SPEED = Quantity("number", 0.01, 100.0)
 _SPAN = Quantity("time", 0.0, 1e6)
-_BYTES = Quantity("number", 0, 2**53)
 NOT_THE_SESSION = ("/rosout", "/parameter_events")
 """Topics that are not recorded."""
 SHARED = ("/tf", "/tf_static")
@@ -162,7 +161,7 @@ class SessionRecorderSettings(Settings):
     )
     exclude: tuple[str, ...] = setting(description="names to leave out", default=())
     max_cache_size: int = setting(
-        _BYTES,
+        Quantity("number", 0, 2**53),
         "bytes of messages that may wait for the disk; 0: whoever publishes in this process waits",
         default=100 * 1024 * 1024,
     )

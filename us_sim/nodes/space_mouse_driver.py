@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from functools import partial
 from typing import Any
@@ -48,23 +49,17 @@ class SpaceMouseDriver(GuardedNode):
     def _run(self) -> None:
         while not self._closing.is_set():
             try:
-                mouse = SpaceMouse()
-                try:
-                    self._follow(mouse)
-                finally:
-                    mouse.close()
+                with contextlib.closing(SpaceMouse()) as mouse:
+                    while not self._closing.is_set():
+                        mouse.wait(self._patience)
+                        now = self.get_clock().now().nanoseconds
+                        self._take((now, mouse.name, list(mouse.axes), mouse.buttons))
             except TrackingError as error:
                 self.call_soon(partial(self._miss, f"{error}; it is tried again"))
                 self._closing.wait(RETRY_S)
             except Exception as error:  # so that the thread does not end silently
                 self.failed("SpaceMouse", error)
                 self._closing.wait(RETRY_S)
-
-    def _follow(self, mouse: SpaceMouse) -> None:
-        while not self._closing.is_set():
-            mouse.wait(self._patience)
-            now = self.get_clock().now().nanoseconds
-            self._take((now, mouse.name, list(mouse.axes), mouse.buttons))
 
     # In the node's thread.
 

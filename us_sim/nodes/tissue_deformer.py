@@ -344,19 +344,14 @@ class TissueDeformer(SceneNode):
             **({"force": f"{force:.2f}"} if deformation.is_balanced else {}),
             "contact_nodes": str(len(deformation.contact_nodes)),
             "action": deformation.action,
-            **self._comparison(),
             **({"structures": self._structures.state} if self._structures else {}),
         }
-
-    def _comparison(self) -> dict[str, str]:
-        apart = self._tissue.difference
-        if apart is None:
-            return {}
-        return {
-            "compared_with": self._tissue.method.compared,
-            "difference_max_mm": f"{1e3 * apart.maximum:.4g}",
-            "difference_rms_mm": f"{1e3 * apart.rms:.4g}",
-        }
+        if (apart := self._tissue.difference) is not None:
+            self.health.values |= {
+                "compared_with": self._tissue.method.compared,
+                "difference_max_mm": f"{1e3 * apart.maximum:.4g}",
+                "difference_rms_mm": f"{1e3 * apart.rms:.4g}",
+            }
 
     def _estimate(self, *, has_time: bool = False) -> None:
         """Estimate the error of the first frame after a report.

@@ -7,9 +7,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from us_sim.settings.text_files import load_yaml
 
@@ -21,8 +21,8 @@ class Topic:
     name: str
     type_name: str  # package and message: geometry_msgs/PoseStamped
     description: str  # for a person
-    publishers: tuple[str, ...] = ()  # nodes of this package; none where a driver publishes it
-    subscribers: tuple[str, ...] = ()
+    publishers: Sequence[str] = ()  # nodes of this package; none where a driver publishes it
+    subscribers: Sequence[str] = ()
     latched: bool = False  # kept for those who come later, else of each moment
     on_demand: bool = False  # not recorded, and so not computed, unless the recorder names it
 
@@ -37,17 +37,6 @@ FROZEN = "frozen"
 """The text of a page that freezes its image."""
 
 
-_NODES = ("publishers", "subscribers")
-
-
-def read_topics() -> tuple[Topic, ...]:
-    """Read ``topics.yaml``, which lies beside this file."""
-    topics = []
-    told = load_yaml(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
-    for name, about in told.items():
-        nodes: dict[str, Any] = {key: tuple(about.pop(key, ())) for key in _NODES}
-        topics.append(Topic(name, **about, **nodes))
-    return tuple(topics)
-
-
-TOPICS = read_topics()
+_TOLD = load_yaml(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
+TOPICS = tuple(Topic(name, **about) for name, about in _TOLD.items())
+"""Those of ``topics.yaml``, which lies beside this file."""

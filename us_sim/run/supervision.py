@@ -30,9 +30,10 @@ from us_sim.settings.spelling import counted
 if TYPE_CHECKING:
     from rclpy.node import Node
 
-    from us_sim.nodes.session_control import Controlled, SessionControl
+    from us_sim.nodes.session_control import SessionControl
     from us_sim.nodes.session_monitor import SessionMonitor
     from us_sim.nodes.settings import SessionControlSettings
+    from us_sim.run.simulation import Simulation
 
 IMAGES, IMAGER = "ultrasound/image", "slice_interpolator"
 RECORDER_STOP_S = 10.0  # a recorder may take to end: it writes what it still holds
@@ -164,11 +165,13 @@ class Supervisor:
         self._listening.callback(node.destroy_node)
         self._listening.callback(self._executor.remove_node, node)
 
-    def control(self, controlled: Controlled, settings: SessionControlSettings) -> SessionControl:
+    def control(self, controlled: Simulation, settings: SessionControlSettings) -> SessionControl:
         """Make the node by which a simulation with these settings is controlled."""
         from us_sim.nodes.session_control import SessionControl
 
-        control = SessionControl(controlled, settings, context=self.monitor.context)
+        control = SessionControl(
+            controlled.check, controlled.take, settings, context=self.monitor.context
+        )
         self._add(control)
         return control
 

@@ -37,12 +37,11 @@ def session_attachments(settings: SessionRecorderSettings) -> dict[str, tuple[st
         attached["parameters.yaml"] = "application/yaml", settings.parameters.encode()
     listed: dict[Path, str] = {}  # checksums
     for name in settings.attach:
+        path = full_path(name)
         try:
-            path = full_path(name)
             is_large = path.stat().st_size > LARGEST
-        except (OSError, ValueError, RuntimeError) as error:  # the last where `~` is nobody's
-            why = getattr(error, "strerror", None) or error
-            raise BagError(f"{name} cannot be attached: {why}") from None
+        except OSError as error:
+            raise BagError(f"{name} cannot be attached: {error.strerror}") from None
         if not path.is_file():
             raise BagError(f"{path} cannot be attached: it is no file")
         if is_large:

@@ -64,8 +64,6 @@ CHECKS = 5.0  # times a second that the age of the newest pose is looked at
 
 _AMBER, _RED, _GREY = (255, 176, 0), (235, 45, 45), (150, 150, 150)
 
-Pixels = NDArray[np.uint8]
-
 
 class AnnotatedImage:
     """``ultrasound/image_annotated``: the image with outlines, scale and a badge.
@@ -132,8 +130,6 @@ class AnnotatedImage:
         is_flipped = self._live.values["shown"].flip
         self._annotation = Annotation(probe, self._structures, is_flipped=is_flipped)
         self._frame: Frame | None = None
-        self._labels: Pixels | None = None
-        self._is_outlined = False
         self._stamp = TimeMessage()  # zero: of a picture of no pose
 
     def pose_came(self) -> None:
@@ -149,8 +145,6 @@ class AnnotatedImage:
         if self.is_wanted:
             _ = frame.pixels
         self._frame, self._stamp = frame, stamp
-        self._labels = None
-        self._is_outlined = not self._structures
         self._image_age.restart()
         if self.is_wanted:
             self._send(self._badge())
@@ -198,32 +192,31 @@ class AnnotatedImage:
         return Badge(f"STALE {age:.1f} s", _AMBER)
 
     def _send(self, badge: Badge | None) -> None:
-        frame, overlay, shown = self._frame, None, self._live.values["shown"]
+        frame, shown = self._frame, self._live.values["shown"]
+        labels, overlay = None, None
         if frame is None:
             image = np.zeros((self._probe.rows, self._probe.columns), np.uint8)
         else:
             image = frame.pixels
-            self._outline(frame)
+            labels = self._labels(frame)
             overlay = self._overlay(frame)
         if self._annotation.is_flipped != shown.flip:
             self._annotation = Annotation(self._probe, self._structures, is_flipped=shown.flip)
         lines = [line for each in self._streams if each.is_wanted for line in each.lines()]
         refine = None if frame is None else partial(onto_border, frame)
-        picture = self._annotation.draw(image, self._labels, badge, overlay, lines, refine)
+        picture = self._annotation.draw(image, labels, badge, overlay, lines, refine)
         if shown.beside:
             plain = image[:, ::-1] if shown.flip else image
             picture = np.hstack([np.repeat(plain[:, :, None], 3, axis=2), picture])
         self._publisher.publish(image_message(picture, self._stamp, "probe"))
         self._node.health.published(_TOPIC)
 
-    def _outline(self, frame: Frame) -> None:
-        if self._is_outlined:
-            return
-        self._is_outlined = True
+    def _labels(self, frame: Frame) -> NDArray[np.uint8] | None:
         try:
-            self._labels = frame.labels
+            return frame.labels if self._structures else None
         except UsSimError as error:
             self._node.health.problem("labels", f"{error}; nothing is outlined")
+            return None
 
     def _overlay(self, frame: Frame) -> Overlay | None:
         stream = self._overlays.get(self._live.values["shown"].overlay)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Header
 
 from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
@@ -61,7 +62,8 @@ class CameraInput(TrackerInput):
             self._source.reset()
 
     def _on_description(self, message: CameraInfo) -> None:
-        if self._described is None or not _is_same(message, self._described):
+        message.header = Header()  # that of each image is another one
+        if message != self._described:
             self._described, self._source = message, None
             self._source = CameraSource(camera_from(message), self._body, self._settings)
 
@@ -82,9 +84,3 @@ class CameraInput(TrackerInput):
         left_out = self._source.last_problem
         self._device.health.values["markers"] = left_out or "all that are seen are used"
         self._device.take(measurement)
-
-
-def _is_same(a: CameraInfo, b: CameraInfo) -> bool:
-    return (a.width, a.height, a.distortion_model) == (b.width, b.height, b.distortion_model) and (
-        list(a.k) == list(b.k) and list(a.d) == list(b.d)
-    )

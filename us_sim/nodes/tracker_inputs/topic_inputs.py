@@ -10,11 +10,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Joy
 from std_msgs.msg import Bool, Header
 
-from us_sim.errors import PoseError, SceneError
+from us_sim.errors import PoseError, SceneError, TrackingError
 from us_sim.geometry.frame_chain import FrameChain
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.qos import FOREIGN
-from us_sim.nodes.tf import TFMessage, require_tf
+from us_sim.nodes.tf import TFMessage
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.recording.decoding import transform_from
 from us_sim.settings.spelling import counted
@@ -71,7 +71,7 @@ class HapticInput(TrackerInput):
         super().__init__(device, settings)
         self._handle = HapticDevice(settings)
         device.subscribe(PoseStamped, "haptic/pose", self._on_pose, FOREIGN)
-        device.subscribe(Bool, "haptic/clutch", self._on_clutch, FOREIGN)
+        device.subscribe(Bool, "haptic/clutch", lambda m: self._handle.clutch(m.data), FOREIGN)
 
     def reset(self) -> None:
         """Forget the clutch."""
@@ -80,9 +80,6 @@ class HapticInput(TrackerInput):
     def _on_pose(self, message: PoseStamped) -> None:
         stamp, pose = self._device.measured(message, "haptic/pose")
         self._device.take(self._handle.take(pose, stamp))
-
-    def _on_clutch(self, message: Bool) -> None:
-        self._handle.clutch(message.data)
 
 
 class SixDofMouseInput(TrackerInput):
@@ -137,7 +134,11 @@ class TfInput(TrackerInput):
 
     def __init__(self, device: Device, settings: Any) -> None:
         super().__init__(device, settings)
-        require_tf()
+        if TFMessage is None:
+            raise TrackingError(
+                "tracker source `tf`: tf2_msgs is not installed, and PyPI does not have it: use a "
+                "ROS 2 installation, or publish geometry_msgs/PoseStamped on tracker/pose"
+            )
         tracker = device.scene.tracker
         if tracker.body is None:
             raise SceneError(
