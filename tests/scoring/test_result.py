@@ -73,7 +73,7 @@ def test_what_became_of_an_attempt(score, void, state):
 
 def test_a_page_has_all_and_no_markup_of_a_name():
     page = result_page(result(), b"\x89PNG")
-    assert "Compression &lt;of&gt; the vein: not passed" in page
+    assert "<h1>Compression &lt;of&gt; the vein</h1><h2>Not passed</h2>" in page
     assert all(word in page for word in ("9.81", "slid", "iVBORw==", "<summary>More", "Ada"))
 
 

@@ -78,7 +78,8 @@ def result_page(result: Mapping[str, Any], picture: bytes = b"") -> str:
     shown = f'<img src="{picture_address(picture)}" alt="{_ALT}">' if picture else ""
     return (
         f'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
-        f"<style>{_STYLE}</style><h1>{title}: {STATES[result['state']]}</h1>"
+        f"<style>{_STYLE}</style><h1>{title}</h1>"
+        f"<h2>{STATES[result['state']].capitalize()}</h2>"
         f"<p>{escape(result['description'])}</p>"
         f"{_table(result['plain'].items(), 'plain')}{_table(steps)}"
         f"{'<h2>Faults</h2>' if faults else ''}{_table(faults, 'fault')}{shown}"

@@ -73,6 +73,7 @@ class ExercisePanel:
             self._plain = ui.grid(columns=2).classes("us-metrics")
             self._image = ui.image().classes("us-score-picture").props("no-spinner")
             self._image.props["alt"] = _ALT
+            self._image.on("click", self._enlarge)
             with ui.expansion("More").classes("us-cases-more"):
                 self._metrics = ui.grid(columns=2).classes("us-metrics")
 
@@ -233,6 +234,12 @@ class ExercisePanel:
             await asyncio.sleep(0.1)
         ui.notify("scorer has drawn nothing: is it still there?", type="warning")
         return False
+
+    def _enlarge(self) -> None:
+        with ui.dialog(value=True).props("maximized") as dialog, ui.card().classes("us-large"):
+            dialog.props["aria-label"] = "The result"
+            ui.image(_address(self._picture)).props("no-spinner").props["alt"] = _ALT
+            ui.button("Close", on_click=dialog.close).props("no-caps")
 
     async def _save(self) -> None:
         from us_sim.scoring.result import result_page  # it brings scipy, which only this takes
