@@ -149,7 +149,7 @@ def test_the_result_is_written_when_the_attempt_has_ended(bench, small_scene, tm
     assert len(result["about"]["checksum"]) == 12
     assert list(result["plain"].values()) == ["8", "5", "0", "110", "1"]
     page = next(out.glob("*.html")).read_text()
-    assert "passed" in page
+    assert "Passed" in page
     assert "data:image/png" in page
 
 

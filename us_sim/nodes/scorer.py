@@ -36,6 +36,12 @@ from us_sim.scoring.settings import ScoreSettings
 
 _PERIOD = 200_000_000  # ns of the probe's poses, after which areas are measured again
 OWN = "scorer"
+_LEVELS = {
+    "done": DiagnosticStatus.OK,
+    "missed": DiagnosticStatus.ERROR,
+    "to do": DiagnosticStatus.WARN,
+}
+"""By states of steps."""
 _REMEMBERED = 256  # poses, for the image with the same stamp
 _CHANGING = ("tissue_deformer", "skin_deformer", "slice_interpolator", "probe_tracker")
 """Nodes whose parameters decide what a learner meets."""
@@ -150,15 +156,15 @@ class Scorer(SceneNode):
         self._keep_result(score)
 
     def _message(self, score: Score) -> DiagnosticArray:
-        told = DiagnosticStatus(
-            level=DiagnosticStatus.OK,
-            name=self._title,
-            message=self._exercise.description if self._exercise is not None else "",
-            hardware_id=self.scene.name,
-            values=[KeyValue(key=each.label, value=each.text) for each in score.metrics],
-        )
         result = self._result(score)
-        message = DiagnosticArray(status=[told, *map(_step_status, score.steps)])
+        first = _status(result["scene"], result["description"], result["metrics"])
+        first.name = result["name"]
+        message = DiagnosticArray(status=[first])
+        for step in result["steps"]:
+            places = {key: json.dumps(step[key]) for key in ("target", "pose") if key in step}
+            status = _status("step", step["seen"], places, _LEVELS[step["state"]])
+            status.name = step["what"]
+            message.status.append(status)
         for fault in result["faults"]:
             values = {"seconds": fault["seconds"]}
             message.status.append(_status("fault", fault["what"], values, DiagnosticStatus.WARN))
@@ -169,7 +175,7 @@ class Scorer(SceneNode):
 
     def _result(self, score: Score) -> dict[str, Any]:
         """Return the document of `us_sim.scoring.result`."""
-        exercise, volume = self._exercise, self.scene.volume
+        exercise, tissue = self._exercise, self.scene.tissue
         about = {
             "student": self._settings.student,
             "begun": self._begun,
@@ -177,11 +183,12 @@ class Scorer(SceneNode):
             "checksum": exercise.checksum if exercise is not None else "",
             "feedback": exercise.feedback if exercise is not None else "live",
             "scene": self.scene.name,
-            "volume": volume.name,
-            "method": self.scene.tissue.solver if self.scene.tissue else "none",
+            "volume": self.scene.volume.name,
+            "method": tissue.solver if tissue is not None else "none",
             "changed": "; ".join(self._changes),
             "us_sim": version("us_sim"),
         }
+        plain = plain_metrics(score, self._limits.force_limit)
         faults = [{"seconds": round(each.time, 1), "what": each.what} for each in score.faults]
         if self._void:
             faults.insert(0, {"seconds": 0.0, "what": self._void})
@@ -192,10 +199,8 @@ class Scorer(SceneNode):
             "state": state_of(score, self._void),
             "seconds": score.seconds,
             "about": about,
-            "plain": {
-                each.label: each.brief for each in plain_metrics(score, self._limits.force_limit)
-            },
-            "steps": [_step_document(step) for step in score.steps],
+            "plain": {each.label: each.brief for each in plain},
+            "steps": [step.document() for step in score.steps],
             "faults": faults,
             "metrics": {each.label: each.text for each in score.metrics},
         }
@@ -207,7 +212,7 @@ class Scorer(SceneNode):
             return
         self._is_kept = True
         scan = self._live.scan()
-        picture = self._drawn(scan, score.steps) if scan is not None else b""
+        picture = self._draw_score(scan, score.steps) if scan is not None else b""
         if not is_last:
             self._publish_picture(picture)
         if self._settings.results:
@@ -220,7 +225,7 @@ class Scorer(SceneNode):
             else:
                 self.get_logger().info(f"the result is in {files[0]}")
 
-    def _drawn(self, scan: Scan, steps: Sequence[Step]) -> bytes:
+    def _draw_score(self, scan: Scan, steps: Sequence[Step]) -> bytes:
         drawn = BytesIO()
         draw_score(drawn, self._title, scan, steps)
         return drawn.getvalue()
@@ -235,7 +240,7 @@ class Scorer(SceneNode):
         score, scan = self._live.score(), self._live.scan()
         if score is None or scan is None:
             return "nothing was done yet"
-        self._publish_picture(self._drawn(scan, score.steps))
+        self._publish_picture(self._draw_score(scan, score.steps))
         return ""
 
     def _clear(self) -> str:
@@ -253,24 +258,6 @@ def _status(
 ) -> DiagnosticStatus:
     told = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
     return DiagnosticStatus(level=level, name=kind, message=message, hardware_id=kind, values=told)
-
-
-def _step_document(step: Step) -> dict[str, Any]:
-    state = "done" if step.is_done else "missed" if step.is_missed else "to do"
-    return {"what": step.what, "state": state, "seen": step.seen}
-
-
-def _step_status(step: Step) -> DiagnosticStatus:
-    values = {}
-    if step.target is not None:
-        values["target"] = json.dumps(step.target.round(4).tolist())
-    if step.pose is not None:
-        pose = [*step.pose.position.tolist(), *step.pose.orientation.tolist()]
-        values["pose"] = json.dumps(pose)
-    level = DiagnosticStatus.ERROR if step.is_missed else DiagnosticStatus.WARN
-    status = _status("step", step.seen, values, DiagnosticStatus.OK if step.is_done else level)
-    status.name = step.what
-    return status
 
 
 main = node_main(Scorer, __name__)

@@ -50,6 +50,16 @@ class Step(NamedTuple):
     pose: Pose | None = None  # of the probe, that is to be found
     is_missed: bool = False  # whether it was tried in vain, and the probe has moved on
 
+    def document(self) -> dict[str, Any]:
+        """Return it as JSON, with its ``state``: done, missed, or to do."""
+        state = "done" if self.is_done else "missed" if self.is_missed else "to do"
+        told: dict[str, Any] = {"what": self.what, "state": state, "seen": self.seen}
+        if self.target is not None:
+            told["target"] = self.target.round(4).tolist()
+        if self.pose is not None:
+            told["pose"] = [*self.pose.position.tolist(), *self.pose.orientation.tolist()]
+        return told
+
 
 class Fault(NamedTuple):
     """Something that was done wrong."""
