@@ -28,6 +28,7 @@ from rosbags.interfaces import Qos
 from rosbags.typesys.store import Typestore
 
 from us_sim.errors import BagError, printable
+from us_sim.recording import MARKER
 from us_sim.recording.metadata import BagMetadata
 from us_sim.recording.schemas import definitions, jazzy_definitions
 from us_sim.recording.storage import (
@@ -36,7 +37,7 @@ from us_sim.recording.storage import (
     missing_files,
     open_storage,
 )
-from us_sim.recording.topic import LOST, MARKER, BagMessage, BagTopic, Fault
+from us_sim.recording.topic import LOST, BagMessage, BagTopic, Fault
 from us_sim.settings.spelling import aligned
 
 

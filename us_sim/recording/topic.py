@@ -84,8 +84,6 @@ def qos_from_yaml(document: Any, where: str = "offered_qos_profiles") -> tuple[Q
 
 LOST = "messages_lost"
 """The note that says how many messages of each topic are missing since the note before."""
-MARKER = "session/marker"
-"""The topic of texts that mark a moment, in the simulator's namespace."""
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ import numpy as np
 
 from us_sim.errors import BagError, ScoreError, UsSimError
 from us_sim.nodes.topics import FROZEN
+from us_sim.recording import MARKER
 from us_sim.recording.path import POSE_STAMPED, ProbePath, is_tracker_recording, read_path
 from us_sim.recording.reader import Bag, read_bag
-from us_sim.recording.topic import MARKER
 from us_sim.run.session_summary import POSE, read_session, scene_of
 from us_sim.run.session_tables import SECOND, WRENCH_STAMPED, Progress, read_wrenches, topics_of
 from us_sim.scene.building import probe_of, volume_of

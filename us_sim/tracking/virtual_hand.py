@@ -22,10 +22,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from us_sim.errors import MeshError, PoseError
 from us_sim.geometry.pose import Pose, product
+from us_sim.geometry.se3 import rotation_exp
 
 _TURNS, _NEAR = 30, 1e-9
 """How often the foot of a perpendicular is improved at most, and how far (m) it may then be off."""
@@ -283,7 +283,6 @@ def _stance(
 
 DEEPEST = 0.02  # m that a probe is pressed at most: a vein closes at half of it, and deeper hurts
 HIGHEST = 0.05  # m that it is lifted off at most
-_ORDER = "ZXY"  # of rotation, fan and rock, each about the probe's axis as those before left it
 STEEPEST = math.radians(60)
 """rad that it is fanned or rocked at most: more, and its grip would lie on the skin."""
 
@@ -318,8 +317,13 @@ class Stance:
         """Find the stance of a probe that is somewhere already: the way back from `pose`."""
         foot, press = surface.under(pose.position)
         x, y, z, w = _upright(foot.normal)
-        turned = Rotation.from_quat(product(np.array([-x, -y, -z, w]), pose.orientation))
-        return cls(foot.point, press, *turned.as_euler(_ORDER).tolist())
+        turned = Pose(np.zeros(3), product(np.array([-x, -y, -z, w]), pose.orientation)).rotation
+        # Rz(rotation) Rx(fan) Ry(rock), taken apart (Diebel 2006, sequence 3-1-2).
+        fan = math.asin(float(np.clip(turned[2, 1], -1.0, 1.0)))
+        if math.hypot(turned[0, 1], turned[1, 1]) < 1e-9:  # fanned by a quarter turn
+            return cls(foot.point, press, math.atan2(turned[1, 0], turned[0, 0]), fan, 0.0)
+        rotation = math.atan2(-turned[0, 1], turned[1, 1])
+        return cls(foot.point, press, rotation, fan, math.atan2(-turned[2, 0], turned[2, 2]))
 
     @classmethod
     def home(cls, surface: RestSurface, press: float) -> Stance:
@@ -334,15 +338,16 @@ class Stance:
     def pose(self, surface: RestSurface) -> Pose:
         """Return the pose of the probe in ``patient``."""
         foot = surface.closest(self.point)
-        turn = Rotation.from_euler(_ORDER, [self.rotation, self.fan, self.rock]).as_quat()
-        orientation = product(_upright(foot.normal), turn)
+        orientation = product(_upright(foot.normal), rotation_exp(_about(2, self.rotation)))
+        orientation = product(orientation, rotation_exp(_about(0, self.fan)))
+        orientation = product(orientation, rotation_exp(_about(1, self.rock)))
         return Pose(foot.point - self.press * foot.normal, orientation)
 
     def slid(self, surface: RestSurface, along_x: float, along_y: float) -> Stance:
         """Slide along the probe's own x and y, m, as it is rotated, to the closest of the skin."""
         foot = surface.closest(self.point)
-        way = Rotation.from_euler("Z", self.rotation).apply([along_x, along_y, 0.0])
-        way = Rotation.from_quat(_upright(foot.normal)).apply(way)
+        turned = product(_upright(foot.normal), rotation_exp(_about(2, self.rotation)))
+        way = Pose(np.zeros(3), turned).rotation @ np.array([along_x, along_y, 0.0])
         return replace(self, point=surface.closest(foot.point + way).point)
 
     def within_reach(self) -> Stance:
@@ -372,3 +377,10 @@ def _upright(normal: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.array([0.0, 1.0, 0.0, 0.0])
     quaternion = np.array([-y, x, 0.0, 1.0 + z])
     return np.asarray(quaternion / np.linalg.norm(quaternion))
+
+
+def _about(axis: int, angle: float) -> NDArray[np.float64]:
+    """(3,) rad, the rotation vector of a turn about one axis."""
+    vector = np.zeros(3)
+    vector[axis] = angle
+    return vector

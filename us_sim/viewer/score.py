@@ -14,7 +14,7 @@ from std_srvs.srv import Trigger
 from us_sim.nodes.guarded_node import GuardedNode, shown
 from us_sim.nodes.qos import LATCHED, STREAM, overridable
 from us_sim.nodes.topics import FROZEN
-from us_sim.recording.topic import MARKER
+from us_sim.recording import MARKER
 from us_sim.scoring.settings import STATES
 from us_sim.viewer.feeds import topic_feed
 from us_sim.viewer.stream import Packet, Posted, Simulator
