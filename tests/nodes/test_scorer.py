@@ -185,3 +185,18 @@ def test_answers_are_refused_where_an_exercise_asks_nothing(node):
     refused = node.set_parameters([Parameter("answers", value=["compressible"])])[0]
     assert not refused.successful
     assert "asks nothing" in refused.reason
+
+
+def test_answers_go_to_their_points_in_any_order(bench, small_scene, tmp_path):
+    file = tmp_path / "blind.yaml"
+    file.write_text("name: b\nfeedback: afterwards\ntask: {kind: compression, points: 3}\n")
+    node = bench.make(Scorer, scene=str(small_scene), exercise=str(file))
+    scores = bench.collect(DiagnosticArray, "score", latched=True)
+    press(bench, 5.0)
+    answers = Parameter("answers", value=["-", "not seen"])
+    assert node.set_parameters([answers])[0].successful
+    bench.spin_until(lambda: bool(scores) and "not seen" in statuses(scores[-1], "step")[1].message)
+    assert "no answer yet" in statuses(scores[-1], "step")[0].message
+    assert not node.set_parameters([Parameter("thrombus", value="4")])[0].successful
+    assert ask(bench, "clear")
+    assert node.get_parameter("answers").value == [""]

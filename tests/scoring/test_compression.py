@@ -281,7 +281,7 @@ def test_right_answers_without_an_examination_do_not_pass():
 
 
 def test_an_answer_ends_a_blind_attempt_only_when_all_are_there():
-    _, made = blind(scanned(examination()), ("compressible", "", "compressible"))
+    _, made = blind(scanned(examination()), ("compressible", "-", "compressible"))
     assert made.ended is None
     made.answer(("compressible",) * 3, "none", 20.0)
     assert [step.is_done for step in made.steps()] == [True] * 4
@@ -300,7 +300,7 @@ def test_what_comes_late_of_before_the_last_answer_counts():
 
 
 @pytest.mark.parametrize(
-    ("points", "thrombus"), [(("maybe",), ""), (("",) * 4, ""), (("",), "4"), (("",), "some")]
+    ("points", "thrombus"), [(("maybe",), ""), (("-",) * 4, ""), (("-",), "4"), (("-",), "some")]
 )
 def test_an_answer_that_is_none_is_refused(points, thrombus):
     with pytest.raises(ScoreError):

@@ -246,7 +246,7 @@ class Scorer(SceneNode):
     def _clear(self) -> str:
         self._keep_result(self._live.score(), is_last=True)
         self._live.clear()
-        self._live_settings.restore({OWN: replace(self._settings, answers=("",), thrombus="")})
+        self._live_settings.restore({OWN: replace(self._settings, answers=(), thrombus="")})
         self._void = ""
         self._begin_attempt()
         self._picture.publish(CompressedImage())  # what was drawn is of before

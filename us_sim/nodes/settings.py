@@ -410,8 +410,8 @@ class ScorerSettings(Settings):
     )
     answers: tuple[str, ...] = setting(
         description="of the learner, where an exercise asks, for each point: compressible, not "
-        "compressible, not seen; empty for none yet",
-        default=("",),
+        "compressible, not seen, or - for none yet",
+        default=(),
         live=True,
     )
     thrombus: str = setting(

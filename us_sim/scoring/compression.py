@@ -25,7 +25,7 @@ from us_sim.scoring.exercise import (
     Task,
 )
 from us_sim.scoring.metrics import Scan
-from us_sim.scoring.settings import ANSWERS, NO_THROMBUS
+from us_sim.scoring.settings import ANSWERS, NO_ANSWER, NO_THROMBUS
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.slicing.settings import WALLS_TOUCH
@@ -207,14 +207,14 @@ class _Examination(Attempt):
             super().answer(points, thrombus, time)
         if self.ended is not None:
             raise ScoreError("answers: the attempt has ended: begin anew")
-        if len(points) > len(numbers) or not {*points} <= {*ANSWERS, ""}:
+        if len(points) > len(numbers) or not {*points} <= {*ANSWERS, NO_ANSWER}:
             raise ScoreError(
-                f"answers: one of {', '.join(ANSWERS)} for each of {len(numbers)} points"
+                f"answers: one of {', '.join(ANSWERS)} or - for each of {len(numbers)} points"
             )
         if thrombus not in ("", NO_THROMBUS, *numbers):
             raise ScoreError(f"thrombus: {NO_THROMBUS}, or a point's number, 1 to {len(numbers)}")
         for point, answer in zip(self._points, points, strict=False):
-            point.answer = answer
+            point.answer = "" if answer == NO_ANSWER else answer
         self._answer = thrombus
         if thrombus and all(point.answer for point in self._points):
             self.ended = time

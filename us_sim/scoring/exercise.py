@@ -117,7 +117,7 @@ class Attempt(ABC):
         """Take the learner's answers so far.
 
         Args:
-            points: one for each point, of `ANSWERS`; "" for none yet.
+            points: one for each point, of `ANSWERS`, or `NO_ANSWER`.
             thrombus: number of a point at it, "none", or "" for no answer yet.
             time: s, when they were given.
 

@@ -20,8 +20,10 @@ STATES = {
 """Words for what became of an attempt."""
 ANSWERS = ("compressible", "not compressible", "not seen")
 """Of a learner, on a point of a vein."""
+NO_ANSWER = "-"
+"""Likewise, where there is none yet."""
 NO_THROMBUS = "none"
-"""Likewise, on where it is."""
+"""Of a learner, on where it is."""
 
 
 @dataclass(frozen=True)

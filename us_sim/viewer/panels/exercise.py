@@ -10,7 +10,7 @@ from typing import Any
 from nicegui import ui
 
 from us_sim.scene.listing import ListedScene
-from us_sim.scoring.settings import ANSWERS, NO_THROMBUS, STATES
+from us_sim.scoring.settings import ANSWERS, NO_ANSWER, NO_THROMBUS, STATES
 from us_sim.viewer.panels.controls import WhileShown
 from us_sim.viewer.remote_parameters import in_time
 from us_sim.viewer.score import PICTURE, SCORE
@@ -212,8 +212,8 @@ class ExercisePanel:
             refused = await self._scorer.set("thrombus", answer)
         else:
             known = self._scorer.parameters.get("answers")
-            answers = list(known.raw) if known is not None else []
-            answers += [""] * (number + 1 - len(answers))
+            answers = [each for each in known.raw if each] if known is not None else []
+            answers += [NO_ANSWER] * (number + 1 - len(answers))
             answers[number] = answer
             refused = await self._scorer.set("answers", answers)
         if refused:
