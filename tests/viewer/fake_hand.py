@@ -37,7 +37,7 @@ class FakeHand:
         self.takes.append(source)
 
     def say(self, **changes: Any) -> None:
-        header = {"leader": "hand", "holder": "", "is_moving": False, "can_take": False}
+        header = {"leader": "hand", "holder": "", "can_take": False}
         header |= {"obstacle": "", "warning": ""}
         header["range"] = RANGES
         header |= {"stance": STANCE, "goal": STANCE, **changes}

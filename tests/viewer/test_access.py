@@ -89,10 +89,10 @@ def test_beyond_this_computer_a_token_is_needed() -> None:
     host = "lab.example:8080"
     assert asked("secret", host=host)[0]["status"] == 403
     assert asked("secret", host=host, query="token=other")[0]["status"] == 403
-    welcome = asked("secret", host=host, query="token=secret&a=1")
+    welcome = asked("secret", host=host, query="token=secret&a=1&watch")
     headers = dict(welcome[0]["headers"])
     assert welcome[0]["status"] == 303
-    assert headers[b"location"] == b"/?a=1"
+    assert headers[b"location"] == b"/?a=1&watch="
     cookie = headers[b"set-cookie"].decode()
     assert "HttpOnly" in cookie
     assert "SameSite=Strict" in cookie

@@ -311,17 +311,53 @@ def test_a_page_whose_connection_was_lost_holds_the_probe_again_unless_another_t
     viewer.say(holder=source)
     page.wait_for_function(said, arg="You hold the probe")
     lost = "() => import('/us_sim/assets/stream.js').then(m => m.stream.reconnect())"
+    viewer.asked.clear()
     viewer.say(holder="")  # its connection has ended
-    viewer.until(lambda: viewer.takes == [source])
+    viewer.until(lambda: len(viewer.asked) == 1)
     page.reload()
-    viewer.until(lambda: viewer.takes[1:] == [source])  # loaded anew it is the same
+    viewer.until(lambda: len(viewer.asked) == 2)  # loaded anew it is the same
+    assert {wish["source"] for wish in viewer.asked} == {source}
+    assert not any(wish["to"] or wish["by"] for wish in viewer.asked)
     page.evaluate(lost)
     page.wait_for_function(said, arg="The viewer does not answer")
     viewer.say(holder="another")
-    page.wait_for_function(said, arg="Another page held the probe last")
+    page.wait_for_function(said, arg="Another page has taken the probe")
     viewer.say(holder="")
     page.wait_for_function(said, arg="Nobody holds the probe")
-    assert set(viewer.takes) == {source}
+    assert len(viewer.asked) == 2
+
+
+def test_a_page_that_does_not_hold_the_probe_has_one_button_that_takes_it_over(
+    page: Any, viewer: FakeHand
+) -> None:
+    button = page.get_by_role("button", name="Take over")
+    assert not button.is_visible()
+    viewer.say(holder="another")
+    button.wait_for()
+    slider = page.locator(".us-quantity input").first
+    assert slider.is_disabled()
+    assert page.locator(".us-said").inner_text() == "Another page holds the probe"
+    button.click()
+    viewer.until(lambda: len(viewer.takes) == 1)
+    viewer.say(holder=viewer.takes[0])
+    button.wait_for(state="hidden")
+    assert slider.is_enabled()
+
+
+def test_a_page_that_only_watches_never_moves_the_probe(page: Any, viewer: FakeHand) -> None:
+    page.goto(f"{page.address}?watch")
+    page.wait_for_selector(".us-quantity input:disabled")
+    page.keyboard.press("s")
+    box = box_of_image(page)
+    page.mouse.move(box["x"] + 9, box["y"] + 9)
+    page.mouse.wheel(0, 100)
+    viewer.say(holder="another")
+    page.get_by_text("This page only watches").wait_for()
+    assert not page.get_by_role("button", name="Take over").is_visible()
+    viewer.say(leader="path_player", obstacle="a.mcap moves the probe", can_take=True)
+    page.get_by_text("a.mcap moves the probe").wait_for()
+    assert not page.get_by_role("button", name="Take the probe").is_visible()
+    assert viewer.asked == []
 
 
 def test_a_viewer_that_says_nothing_any_more_does_not_answer(page: Any, viewer: FakeHand) -> None:

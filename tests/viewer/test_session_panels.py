@@ -8,6 +8,7 @@ from awaiting import until
 
 from us_sim.scene.listing import ListedScene
 from us_sim.viewer.session import SessionBoard, SessionState
+from us_sim.viewer.stream import Feed, Packet
 
 RUNNING = SessionState(True, "running", "upper_arm", "/arm.yaml")
 
@@ -35,7 +36,7 @@ def opened(page, tab):
     page.get_by_role("tab", name=tab).click()
 
 
-def test_a_case_is_loaded_and_a_recording_is_not_ended_unasked(page, session):
+def test_a_case_is_loaded_and_what_is_done_is_not_ended_unasked(page, session, simulator):
     board, asked = session
     board.scenes = (
         ListedScene("upper_arm", "/arm.yaml", description="An arm.", tracker="pose"),
@@ -56,10 +57,19 @@ def test_a_case_is_loaded_and_a_recording_is_not_ended_unasked(page, session):
     board.state = dataclasses.replace(RUNNING, record="a.mcap")
     until(page.get_by_role("button", name="Load liver").is_enabled, "it can be loaded again", 30.0)
     page.get_by_role("button", name="Load liver").click()
-    page.get_by_role("button", name="Go on recording").click()
+    page.get_by_role("button", name="Go on").click()
     page.get_by_role("button", name="Load liver").click()
     page.get_by_role("dialog").get_by_role("button", name="Load").click()
     until(lambda: len(asked) == 2, "it is asked for once more", 30.0)
+    board.state = RUNNING
+    step = {"what": "press", "seen": "", "state": "to do"}
+    header = {"name": "compression", "description": "", "scene": "upper_arm", "metrics": {}}
+    simulator.add(Feed("score"))
+    simulator.feeds["score"].offer(lambda n: Packet("score", n, {**header, "steps": [step]}, b""))
+    page.get_by_role("button", name="Load liver").click()
+    page.get_by_text("Loading liver ends the attempt at compression.").wait_for()
+    page.get_by_role("button", name="Go on").click()
+    assert len(asked) == 2
 
 
 def test_a_session_is_recorded_and_replayed(page, session):

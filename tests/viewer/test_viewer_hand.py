@@ -234,35 +234,40 @@ def test_the_pose_that_contains_a_wish_is_known_by_its_stamp(bench, page, tracke
     assert of_others["press"] == pytest.approx(0.004)
 
 
-def test_the_page_that_moved_the_probe_last_holds_it_until_another_does_or_it_goes(
-    bench, page, tracked
+@pytest.mark.usefixtures("tracked")
+def test_the_first_page_that_moves_the_probe_holds_it_until_it_goes_or_another_takes_over(
+    bench, page
 ):
     simulator = page._holder.simulator
 
-    def told(holder, *, is_moving):
-        return (page.state["holder"], page.state["is_moving"]) == (holder, is_moving)
+    def other(connection, **wish):
+        asked = {"source": "other", "sequence": 1, **wish}
+        return simulator.commands["hand"](asked, connection)
+
+    def held_by(holder):
+        bench.spin_until(lambda: page.state["holder"] == holder)
 
     page.open()
     page.await_leader("hand")
-    bench.spin_until(lambda: len(tracked) >= 1)
-    assert told("", is_moving=False)
-    page(by={"press": 0.001})
-    bench.spin_until(lambda: told("page", is_moving=True))
-    bench.spin_until(lambda: told("page", is_moving=False))
-    simulator.commands["hand"]({"source": "other", "sequence": 1, "by": {"press": 0.001}}, 2)
-    bench.spin_until(lambda: told("other", is_moving=True))
+    held_by("")
+    assert page(by={"press": 0.001}) is None
+    held_by("page")
+    bench.spin_until(lambda: page.state["goal"]["press"] == pytest.approx(0.002))
+    assert other(2, to={"x": 0.037}).startswith("another page holds the probe: Take over")
+    bench.spin_for(5)
+    assert page.state["goal"]["x"] == 0.0
+    assert simulator.commands["take"]("other", 2) is None
+    held_by("other")
+    assert "Take over" in page(by={"press": 0.001})
     for leave in simulator.leaving:
-        leave(1)  # which was not the holder
-    bench.spin_until(lambda: told("other", is_moving=False))
+        leave(1)  # which is not the holder
+    bench.spin_for(5)
+    held_by("other")
     for leave in simulator.leaving:
         leave(2)
-    bench.spin_until(lambda: told("", is_moving=False))
-    # A page that comes back may hold what nobody holds, and takes it from nobody else.
-    simulator.commands["take"]("other", 3)
-    bench.spin_until(lambda: told("other", is_moving=False))
-    simulator.commands["take"]("page", 4)
-    bench.spin_for(5)
-    assert told("other", is_moving=False)
+    held_by("")
+    assert other(3) is None  # it comes back, and holds what nobody holds
+    held_by("other")
 
 
 def test_the_probe_stands_on_the_skin_along_its_normal(bench, page, tracked):

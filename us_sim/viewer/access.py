@@ -113,7 +113,7 @@ class Access:
 
     async def _welcome(self, scope: Any, send: Any) -> None:
         """Put the token into a cookie, and show the one page there is, without it."""
-        query = parse_qs(scope["query_string"].decode("latin-1"))
+        query = parse_qs(scope["query_string"].decode("latin-1"), keep_blank_values=True)
         query.pop("token")
         rest = urlencode(query, doseq=True)
         where = f"/?{rest}" if rest else "/"

@@ -45,7 +45,7 @@ ASTRAY, SETTLED = 3e-3, 1.0
 """m, and s of rest, from which on the tracked probe is not where it was put."""
 SAME_PATIENT = 0.02  # m, from one surface to the next: the probe stays where it is
 _KEPT = 512  # poses, until their images are made
-_MOVES_S = 2.0  # after its last wish a page holds the probe, and moves it no more
+_HELD = "another page holds the probe: Take over moves it to this one"
 
 
 @dataclass(frozen=True)
@@ -153,9 +153,10 @@ class ViewerHand:
     """A tracker source that pages move: ``tracker/pose`` in frame ``patient``.
 
     It holds the probe only while a page watches and nobody else does: a driver or a player leads as
-    long as it has a publisher, and the hand goes on from where that has left the probe. Poses come
-    as soon as a page asks, `MOVING_HZ` while the probe moves or a page watches what goes on by
-    itself, such as blood, and `RESTING_HZ` else.
+    long as it has a publisher, and the hand goes on from where that has left the probe. One page
+    moves it: the first that does, until its connection ends or another takes over. Poses come as
+    soon as that asks, `MOVING_HZ` while the probe moves or a page watches what goes on by itself,
+    such as blood, and `RESTING_HZ` else.
 
     Args:
         node: that publishes.
@@ -172,7 +173,7 @@ class ViewerHand:
         self.feed = Feed("hand", lambda _: post(self._on_watch), 10.0)
         simulator.add(self.feed)
         simulator.commands |= {"hand": self._on_command, "take": self._on_take}
-        simulator.leaving.append(lambda page: post(lambda: self._on_leave(page)))
+        simulator.leaving.append(self._on_leave)
         self._state = HandState.IDLE
         self._lead = Lead("nobody", "the viewer finds out who moves the probe")
         self._surface = PatientSurface(node, rest)
@@ -186,8 +187,9 @@ class ViewerHand:
         )
         self._is_found = False  # whether it is known where the probe is, or that it is nowhere yet
         self._elsewhere: Pose | None = None  # where somebody else has the probe
-        self._page = ""  # that acted last; nothing if none has, or once it has gone
-        self._connection = 0  # of that page
+        # The page that holds the probe, "" if none does, and its connection. Only the web server's
+        # thread sets them, in which all commands come: of two pages one is the first.
+        self._page, self._connection = "", 0
         self._wish: tuple[str, int] | None = None  # the last: its page, and that page's number
         self._published: dict[int, tuple[float, tuple[str, int] | None]] = {}
         """By stamp (ns): how deep (m) the pose is pressed, and the last wish that it contains."""
@@ -347,36 +349,35 @@ class ViewerHand:
             asked = HandCommand.read(value)
         except UsSimError as error:
             return str(error)
-        if not self._lead.obstacle:
-            self._post(lambda: self._obey(asked, connection))
-        return self._lead.obstacle or None
-
-    def _on_take(self, page: Any, connection: int) -> str | None:
-        """Hold the probe that nobody holds, or that a replay moves, which ends; in its thread."""
-        if self._lead.can_take:
-            self._simulator.session.ask(replay="")
-        elif self._lead.obstacle or self._page not in ("", page):
-            return self._lead.obstacle or None
-        if is_source(page):
-            self._post(lambda: self._hold(page, connection))
+        if self._lead.obstacle:
+            return self._lead.obstacle
+        if self._page not in ("", asked.source):
+            return _HELD
+        self._page, self._connection = asked.source, connection
+        self._post(lambda: self._obey(asked))
         return None
 
-    def _hold(self, page: str, connection: int) -> None:
-        """Let a page hold the probe, until another acts or its connection ends."""
-        self._page, self._connection = page, connection
+    def _on_take(self, page: Any, connection: int) -> str | None:
+        """Let a page hold the probe, whichever held it; a replay that moves it ends."""
+        if self._lead.can_take:
+            self._simulator.session.ask(replay="")
+        elif self._lead.obstacle:
+            return self._lead.obstacle
+        if is_source(page):
+            self._page, self._connection = page, connection
+        return None
 
     def _on_leave(self, connection: int) -> None:
         if connection == self._connection:
             self._page = ""
 
-    def _obey(self, asked: HandCommand, connection: int) -> None:
+    def _obey(self, asked: HandCommand) -> None:
         """Move to where a page wants the probe, from now on."""
         if not self._state.holds:
             return  # somebody else has taken it meanwhile
         assert self._motion is not None
         assert self._standing is not None
         self._motion.aim(asked.stance(self._motion.goal, self._standing))
-        self._hold(asked.source, connection)
         self._wish, self._asked_at = (asked.source, asked.sequence), time.monotonic()
         if self._state is HandState.RESTING:
             self._enter(HandState.MOVING)
@@ -412,11 +413,11 @@ class ViewerHand:
 
     def _tell(self) -> None:
         """Tell the pages how the probe is held, and by whom."""
-        now, motion, surface = time.monotonic(), self._motion, self._standing
+        motion, surface = self._motion, self._standing
         stance, goal = (motion.stance, motion.goal) if motion is not None else (None, None)
         if not self._state.holds and self._elsewhere is not None and surface is not None:
             stance = goal = Stance.of(self._elsewhere, surface)
-        silent = now - max(self._followed_at, self._held_at)
+        silent = time.monotonic() - max(self._followed_at, self._held_at)
         warning = self._warning
         if self._state.holds and silent > UNANSWERED:
             warning = (
@@ -425,7 +426,6 @@ class ViewerHand:
         header: dict[str, Any] = {
             "leader": self._lead.who,
             "holder": self._page,
-            "is_moving": bool(self._page) and now - self._asked_at < _MOVES_S,
             "every": 1.0 / RESTING_HZ,  # s, at the latest
             "is_resting": self._state is HandState.RESTING,
             "obstacle": self._lead.obstacle,

@@ -12,6 +12,7 @@ from nicegui import ui
 
 from us_sim.scene.listing import ListedScene
 from us_sim.viewer.panels.controls import WhileShown
+from us_sim.viewer.panels.exercise import told_score
 from us_sim.viewer.remote_parameters import in_time
 from us_sim.viewer.session import CONTROL, NOT_THERE, SessionState
 from us_sim.viewer.stream import Simulator
@@ -26,7 +27,7 @@ class CasesPanel:
     """The panel of scenes and cases to load."""
 
     def __init__(self, simulator: Simulator) -> None:
-        self._board = simulator.session
+        self._simulator, self._board = simulator, simulator.session
         self._shown: tuple[object, ...] = ()
         with WhileShown(self._board.watch, self._board.unwatch, EVERY_S, self._refresh):
             self._state = ui.label().classes("us-session-state").props('role="status"')
@@ -96,23 +97,28 @@ class CasesPanel:
                 button.props["title"] = AGAIN if is_loaded else ANOTHER
 
     async def _load(self, scene: ListedScene) -> None:
-        state = self._board.state
-        if state.record and not await self._is_sure(scene, state.record):
+        ends = self._what_ends()
+        if ends and not await self._is_sure(scene, ends):
             return
         refused = await in_time(self._board.ask(scene=scene.origin), CONTROL)
         if refused:
             ui.notify(refused, type="warning", multi_line=True)
 
-    async def _is_sure(self, scene: ListedScene, record: str) -> bool:
-        """Ask, since the recording ends with its scene."""
+    def _what_ends(self) -> str:
+        """Name what a person does and would lose with the scene."""
+        record, score = self._board.state.record, told_score(self._simulator)
+        ends = [f"the recording {record}, which is kept as it is"] if record else []
+        ends += [f"the attempt at {score['name']}"] if score.get("steps") else []
+        return ", and ".join(ends)
+
+    async def _is_sure(self, scene: ListedScene, ends: str) -> bool:
+        """Ask, since something ends with its scene."""
         with ui.dialog() as dialog, ui.card():
             dialog.props["aria-label"] = "Load another scene"
-            ui.label(f"Loading {scene.name} ends the recording {record}. It is kept as it is.")
+            ui.label(f"Loading {scene.name} ends {ends}.")
             with ui.row():
                 ui.button("Load", on_click=lambda: dialog.submit(True)).props("no-caps")
-                ui.button("Go on recording", on_click=lambda: dialog.submit(False)).props(
-                    "flat no-caps"
-                )
+                ui.button("Go on", on_click=lambda: dialog.submit(False)).props("flat no-caps")
         return bool(await dialog)
 
 

@@ -25,6 +25,10 @@ let sent = -TOGETHER_MS;
 let isDue = false;
 /** Whether this page was the last that held the probe, as far as it knows. */
 let isMine = Boolean(kept);
+/** Whether another page has taken the probe from this one. */
+let isTaken = false;
+/** Whether the address says that this page never moves the probe. */
+const isWatching = new URLSearchParams(location.search).has("watch");
 addEventListener("pagehide", () => isMine && sessionStorage.setItem(KEPT, source));
 let heard = 0;
 let isSilent = false;
@@ -33,7 +37,7 @@ const SILENT_MS = 3000;
 const handlers = [];
 
 export const hand = {
-  /** The newest of the viewer: {leader, holder, is_moving, is_resting, obstacle, warning, stance, goal, range}, or null. */
+  /** The newest of the viewer: {leader, holder, is_resting, obstacle, warning, stance, goal, range}, or null. */
   state: null,
 
   /** Have `handler(state)` called with each newer state. */
@@ -46,22 +50,35 @@ export const hand = {
     return stream.isOpen && !isSilent;
   },
 
+  /** Whether this page only watches. */
+  isWatching,
+
+  /** Whether another page has taken the probe from this one. */
+  get isTaken() {
+    return isTaken;
+  },
+
+  /** Whether pages move the probe. */
+  get isOfPages() {
+    return this.isAnswered && this.state?.leader === "hand";
+  },
+
   /** Whether the page may move the probe. */
   get leads() {
-    return this.isAnswered && this.state?.leader === "hand";
+    return this.isOfPages && !isWatching && !this.isHeldElsewhere;
   },
 
   /** Whether no page holds the probe. */
   get isFree() {
-    return this.leads && !this.state.holder;
+    return this.isOfPages && !this.state.holder;
   },
 
-  /** Whether another page acted last. */
+  /** Whether another page holds the probe. */
   get isHeldElsewhere() {
-    return this.leads && Boolean(this.state.holder) && this.state.holder !== source;
+    return this.isOfPages && !this.isFree && this.state.holder !== source;
   },
 
-  /** End what is replayed, and hold the probe from there on. */
+  /** Hold the probe, whichever page does; what is replayed ends. */
   take() {
     stream.send({ take: source });
   },
@@ -72,6 +89,7 @@ export const hand = {
    * `time`: ms of `performance.now()`, when the person did what this follows from.
    */
   ask({ to = {}, by = {}, go = undefined }, time = performance.now()) {
+    if (isWatching) return;
     if (go) flush();
     if (!wish) {
       wish = { to: {}, by: {} };
@@ -114,8 +132,9 @@ stream.on("hand", (header) => {
   hand.state = header;
   heard = performance.now();
   isSilent = false;
+  isTaken = hand.isHeldElsewhere && (isTaken || isMine);
   if (header.holder) isMine = header.holder === source;
-  else if (isMine && hand.leads) hand.take(); // the connection was lost, and nobody took it since
+  else if (isMine && hand.leads) hand.ask({}); // the connection was lost, and nobody took it since
   tell();
 });
 stream.watch("hand");

@@ -26,6 +26,8 @@ const BUTTONS = [
   ["Lift", "10 mm off the skin (key L)", () => hand.ask({ go: "lift" })],
   ["Upright", "Without fan, rock and rotation (key U)", () => hand.ask({ go: "upright" })],
 ];
+const OF_REPLAY = "End the replay; the probe stays where it is, and you hold it";
+const OF_PAGE = "The probe stays where it is; you hold it, and the other page no longer does";
 const SAID_MS = 5000;
 const PACE_MS = 500;
 
@@ -38,9 +40,7 @@ const place = await element("hand");
 const rows = QUANTITIES.map(makeRow);
 const said = make("p", { className: "us-said" });
 said.setAttribute("role", "status");
-const take = make("button", { type: "button", textContent: "Take the probe", hidden: true });
-take.className = "us-on";
-take.title = "End the replay; the probe stays where it is, and you hold it";
+const take = make("button", { type: "button", className: "us-on", hidden: true });
 take.onclick = () => hand.take();
 const moves = []; // buttons that need the probe
 const pace = make("span", { className: "us-pace" });
@@ -154,18 +154,25 @@ function show() {
   if (!state) return;
   for (const row of rows) row.show(state, hand.leads);
   for (const button of moves) button.disabled = !hand.leads;
-  take.hidden = !state.can_take || !hand.isAnswered;
+  take.hidden = hand.isWatching || !(hand.isAnswered && (state.can_take || hand.isHeldElsewhere));
+  put(take, "textContent", state.can_take ? "Take the probe" : "Take over");
+  put(take, "title", state.can_take ? OF_REPLAY : OF_PAGE);
   if (hand.leads && !led) problemEnds = 0; // what was in the way is not any more
   led = hand.leads;
   const isProblem = performance.now() < problemEnds;
   const silent = hand.isAnswered ? "" : "The viewer does not answer: nobody holds the probe";
-  said.classList.toggle("us-wrong", isProblem || Boolean(silent || state.warning));
-  const other = state.is_moving ? "Another page moves the probe" : "Another page held the probe last";
-  const own = hand.isFree ? "Nobody holds the probe: move it to take it" : "You hold the probe";
-  const holder = hand.isHeldElsewhere ? other : own;
-  const words = isProblem ? problem : silent || state.warning || state.obstacle || holder;
+  said.classList.toggle("us-wrong", isProblem || hand.isTaken || Boolean(silent || state.warning));
+  const words = isProblem ? problem : silent || state.warning || state.obstacle || holder();
   put(said, "textContent", words);
   put(said, "title", words);
+}
+
+/** Which page holds the probe, for a person. */
+function holder() {
+  const other = hand.isTaken ? "Another page has taken the probe" : "Another page holds the probe";
+  if (hand.isWatching) return "This page only watches";
+  if (hand.isHeldElsewhere) return other;
+  return hand.isFree ? "Nobody holds the probe: move it to take it" : "You hold the probe";
 }
 
 setInterval(() => {

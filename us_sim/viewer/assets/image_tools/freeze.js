@@ -1,6 +1,7 @@
 /** Freezing the image, and looking through the last seconds before that. */
 
 import { events } from "../events.js";
+import { hand } from "../hand/hand.js";
 import { drawKept, hasImage, isOfOtherScene, onImage, setLive } from "../image.js";
 import { stream } from "../stream.js";
 import { Cine } from "./cine.js";
@@ -47,7 +48,7 @@ export const freeze = {
     number = Math.max(0, cine.frames.length - 1);
     setLive(!isFrozen);
     events.tell("image-frozen", isFrozen);
-    if (isFrozen) stream.send({ frozen: true });
+    if (isFrozen && !hand.isWatching && !hand.isHeldElsewhere) stream.send({ frozen: true });
     tell();
   },
 
