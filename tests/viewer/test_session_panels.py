@@ -36,7 +36,7 @@ def opened(page, tab):
     page.get_by_role("tab", name=tab).click()
 
 
-def test_a_case_is_loaded_and_what_is_done_is_not_ended_unasked(page, session, simulator):
+def test_a_case_is_loaded_and_a_recording_is_not_ended_unasked(page, session):
     board, asked = session
     board.scenes = (
         ListedScene("upper_arm", "/arm.yaml", description="An arm.", tracker="pose"),
@@ -61,15 +61,21 @@ def test_a_case_is_loaded_and_what_is_done_is_not_ended_unasked(page, session, s
     page.get_by_role("button", name="Load liver").click()
     page.get_by_role("dialog").get_by_role("button", name="Load").click()
     until(lambda: len(asked) == 2, "it is asked for once more", 30.0)
-    board.state = RUNNING
+
+def test_an_exercise_is_not_ended_unasked(page, session, simulator):
+    board, asked = session
+    board.scenes = (ListedScene("liver", "case:/liver", "case"),)
     step = {"what": "press", "seen": "", "state": "to do"}
     header = {"name": "compression", "description": "", "scene": "upper_arm", "metrics": {}}
     simulator.add(Feed("score"))
     simulator.feeds["score"].offer(lambda n: Packet("score", n, {**header, "steps": [step]}, b""))
+    page.goto(page.address)
+    page.get_by_role("tab", name="Cases").click()  # the panel of the exercise has opened
     page.get_by_role("button", name="Load liver").click()
     page.get_by_text("Loading liver ends the attempt at compression.").wait_for()
-    page.get_by_role("button", name="Go on").click()
-    assert len(asked) == 2
+    assert asked == []
+    page.get_by_role("dialog").get_by_role("button", name="Load").click()
+    until(lambda: asked == [{"scene": "case:/liver"}], "it is asked for", 30.0)
 
 
 def test_a_session_is_recorded_and_replayed(page, session):
