@@ -49,8 +49,8 @@ def test_pixels_are_drawn_as_they_were_sent(page: Any, simulator: Simulator) -> 
     assert box["width"] / box["height"] == pytest.approx(512 / 300, rel=1e-3)
 
 
-@pytest.mark.parametrize(("force", "words"), [({}, "no image"), ({"force_age": 0.7}, "no tissue")])
-def test_nothing_is_said_to_be_at_rest_that_says_nothing(
+@pytest.mark.parametrize(("force", "words"), [({}, "no images come"), ({"force_age": 0.7}, "the tissue does not answer")])
+def test_an_image_is_not_said_to_be_still_where_nothing_comes(
     page: Any, simulator: Simulator, force: dict[str, float], words: str
 ) -> None:
     image, _ = feeds_of(simulator)
@@ -63,7 +63,7 @@ def test_nothing_is_said_to_be_at_rest_that_says_nothing(
 
     def is_at_rest() -> bool:
         offer(image, np.zeros((3, 4), np.uint8))
-        return bool(page.locator("#readout").inner_text() == "at rest")
+        return bool(page.locator("#readout").inner_text() == "still image")
 
     until(is_at_rest, "images come")
     page.wait_for_function(f"document.querySelector('#readout').textContent === '{words}'")

@@ -215,9 +215,11 @@ def test_targets_stand_on_the_skin_in_the_colours_of_their_states_and_move_with_
     for name in ("image", "structures", "force"):
         scene.ask(f"scene.setVisible('{name}', false)")
     states = {-0.04: "done", -0.02: "missed", 0.0: "to do", 0.02: "to do"}
+    places = [([-0.02, y, 0.013], state) for y, state in states.items()]
+    places.append(([0.0, 0.04, 0.013], "done"))  # which the probe hides
     steps = [
-        {"what": "", "seen": "", "state": state, "target": [[-0.02, y, 0.013]]}
-        for y, state in states.items()
+        {"what": f"{number}: vein", "seen": "open", "state": state, "target": [place]}
+        for number, (place, state) in enumerate(places, 1)
     ]
     score = scene.patient.feeds["score"]
     score.offer(lambda n: Packet("score", n, {"scene": "", "steps": steps}, b""))
@@ -228,12 +230,16 @@ def test_targets_stand_on_the_skin_in_the_colours_of_their_states_and_move_with_
     scene.becomes(stands(-0.04), lambda c: c[1] > c[0] + 60 and c[1] > c[2] + 40)  # green
     scene.becomes(stands(-0.02), lambda c: c[0] > c[2] + 80 and c[0] > c[1] + 80)  # red
     scene.becomes(stands(0.0), lambda c: c.min() > 200)  # white
-    scene.becomes(stands(0.02), lambda c: c[0] > c[2] + 100 and c[1] > c[2] + 50)  # orange
+    scene.becomes(stands(0.02), lambda c: c[2] > c[0] + 100 and c[2] > c[1] + 50)  # blue
+    assert scene.page.locator(".us-task").inner_text() == "4: vein: open"
+    numbers = scene.page.locator(".us-number:not([hidden])")
+    assert numbers.all_inner_texts() == ["1", "2", "3", "4"]
+    scene.becomes([0.0, 0.04, 0.0], lambda c: not (c[1] > c[0] + 60))
     scene.patient.dent(np.add(SKIN.vertices, [0.0, 0.0, 0.01]))
-    scene.ask("scene.view('front')")
-    scene.becomes(stands(-0.04, 0.0095), lambda c: c[1] > c[0] + 60 and c[1] > c[2] + 40)
+    scene.ask("scene.setVisible('probe', false); scene.view('front')")
+    scene.becomes(stands(0.02, 0.0095), lambda c: c[2] > c[0] + 100 and c[2] > c[1] + 50)
     scene.ask("scene.setVisible('targets', false)")
-    scene.becomes(stands(-0.04, 0.0095), lambda c: not (c[1] > c[0] + 60))
+    scene.becomes(stands(0.02, 0.0095), lambda c: not (c[2] > c[0] + 60))
 
 
 def test_the_pointer_meets_the_skin_and_its_normal(scene):

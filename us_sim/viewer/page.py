@@ -324,12 +324,13 @@ def build_page(simulator: Simulator) -> None:
         button.props["aria-expanded"] = str(drawer.visible).lower()
 
     def show_exercise() -> None:
-        """Open its panel, once, when there is one."""
+        """Open its panel, once, when there is one and the window has room beside the 3D view."""
         if told_score(simulator).get("steps"):
             asking.deactivate()
             tabs.set_value("Exercise")
             if not drawer.visible:
-                toggle()
+                open_it = "document.getElementById('us-panels').click()"
+                ui.run_javascript(f"if (innerWidth > 939) {open_it}")
 
     def hide_truth() -> None:
         """Leave out what tells of what there is to be found, while an exercise asks."""

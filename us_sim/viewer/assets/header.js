@@ -4,13 +4,13 @@ import { element, events } from "./events.js";
 import { stream } from "./stream.js";
 
 const WINDOW_MS = 2000;
-/** ms without an image after which nothing is said to be at rest: five a second come then. */
+/** ms without an image after which the image is not said to be still: five a second come then. */
 const SILENT_MS = 500;
 const times = [];
 
 const readout = await element("readout");
 readout.setAttribute("role", "status");
-readout.title = "Ultrasound images drawn in this page; at rest, while nothing moves, a few a second";
+readout.title = "Ultrasound images drawn in this page; of a probe that stays where it is a few a second";
 
 let connected = false;
 let frozen = false;
@@ -22,8 +22,8 @@ function show() {
   const now = performance.now();
   while (times.length && now - times[0] > WINDOW_MS) times.shift();
   const rate = (1000 * times.length) / WINDOW_MS;
-  const silent = forceAge > SILENT_MS / 1000 ? "no tissue" : "no image";
-  const still = now - last > SILENT_MS ? silent : "at rest";
+  const silent = forceAge > SILENT_MS / 1000 ? "the tissue does not answer" : "no images come";
+  const still = now - last > SILENT_MS ? silent : "still image";
   const live = resting ? still : `${rate.toFixed(0)} images/s`;
   const rated = frozen ? "frozen" : live;
   const words = connected ? rated : "the viewer does not answer";

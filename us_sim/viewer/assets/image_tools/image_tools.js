@@ -6,7 +6,7 @@ import { isTyping } from "../hand/typing.js";
 import { compare } from "./compare.js";
 import { freeze } from "./freeze.js";
 import { overlay } from "./overlay.js";
-import { KINDS, comparedWith, factsOf, save } from "./picture.js";
+import { KINDS, comparedWith, othersOf, pressOf, save } from "./picture.js";
 
 const style = document.createElement("link");
 style.rel = "stylesheet";
@@ -21,7 +21,10 @@ list.className = "us-values";
 list.setAttribute("aria-label", "Measured values");
 place.append(bar);
 const facts = Object.assign(document.createElement("p"), { className: "us-facts" });
-facts.title = "Of the image that is shown";
+facts.title = "Of the image that is shown: how deep the probe is pressed, and the force on it";
+const pressed = document.createElement("b");
+const others = document.createElement("span");
+facts.append(pressed, others);
 (await element("ultrasound")).append(list, facts);
 
 function button(text, title, onclick) {
@@ -130,12 +133,18 @@ function showFreeze() {
   moment.textContent = `${before.toFixed(1)} s`;
 }
 
-/** Of a frozen image, and of what the image is compared with. */
+/** How the image was pressed; what else is known of a frozen one, and what it is compared with. */
 function showFacts() {
   press(comparing, Boolean(compare.held));
   const frame = frameShown();
-  const said = frame && freeze.isFrozen ? factsOf(frame) : [];
-  facts.textContent = [...said, ...comparedWith(frame)].join(" · ");
+  const said = frame && freeze.isFrozen ? othersOf(frame) : [];
+  put(pressed, frame ? pressOf(frame).join(" · ") : "");
+  put(others, [...said, ...comparedWith(frame)].join(" · "));
+}
+
+/** Have an element say these words, unless it does. */
+function put(part, words) {
+  if (part.textContent !== words) part.textContent = words;
 }
 
 function showMeasures() {
@@ -197,6 +206,7 @@ freeze.on(showFreeze);
 overlay.on(showMeasures);
 compare.on(showFacts);
 events.on("connection", showFreeze);
+events.on("image-shown", showFacts);
 events.on("image-drawn", () => freezing.disabled && showWhetherUsable());
 showFreeze();
 showWhetherUsable();

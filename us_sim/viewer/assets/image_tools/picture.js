@@ -25,19 +25,24 @@ export function comparedWith(frame) {
   return compare.isWith(frame) ? [`difference from ${factsOf(compare.held).join(" · ")}`] : [];
 }
 
-/** What is known of a frame, in words, as far as it is known. */
-export function factsOf(frame) {
-  const { matrix, rows, settings = {}, press, force } = frame.header;
-  const of = (value, factor, unit) =>
-    value === undefined ? [] : [`${(factor * value).toFixed(1).replace(/^-(0\.0)$/, "$1")} ${unit}`];
+/** How the probe pressed and was pressed at a frame, in words, as far as it is known. */
+export function pressOf({ header: { press, force } }) {
+  const of = (name, value, unit) =>
+    value === undefined ? [] : [`${name} ${value.toFixed(1).replace(/^-(0\.0)$/, "$1")} ${unit}`];
+  return [...of("press", press && 1000 * press, "mm"), ...of("force", force, "N")];
+}
+
+/** What else is known of a frame, in words. */
+export function othersOf(frame) {
+  const { matrix, rows, settings = {} } = frame.header;
   return [
     timeOf(frame),
     ...(matrix ? [`depth ${pixelToMillimetres(0, rows - 0.5, matrix)[1].toFixed(1)} mm`] : []),
     ...Object.entries(settings).map(([name, value]) => `${name} ${value}`),
-    ...of(press, 1000, "mm").map((text) => `press ${text}`),
-    ...of(force, 1, "N").map((text) => `force ${text}`),
   ];
 }
+
+const factsOf = (frame) => [...othersOf(frame), ...pressOf(frame)];
 
 /**
  * The picture of a frame on a canvas, with other canvases below it; null where it is not known where

@@ -86,7 +86,7 @@ const panel = make(
   row("Force", "Show the tissue's force on the probe, in N", {
     onToggle: (on) => probe.setVisible("force", on),
   }).line,
-  row("Targets", "Show where the exercise is to be done: next in orange, done in green", {
+  row("Targets", "Show where the exercise is to be done: next in blue, done in green", {
     onToggle: (on) => targets.setVisible(on),
   }).line,
   make("div", { className: "us-caption", textContent: "Tissue" }),
