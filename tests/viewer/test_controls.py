@@ -59,6 +59,12 @@ def test_only_the_settings_of_the_methods_in_use_are_shown():
     assert ("Settings of msds", ("msds.steps",)) in shown()
     every = {name for section in arrange_tissue(parameters) for name in section.names}
     assert every == set(parameters)
+    empty = Parameter("n", "materials.fat.lumen_pressure", Kind.NUMBER, 0.0, may_be_nothing=True)
+    parameters[empty.name] = empty
+    name = "materials.bone.lumen_pressure"
+    parameters |= known(name, may_be_nothing=True)
+    (pressure,) = (s for s in arrange_tissue(parameters) if s.title == "Pressure of blood")
+    assert pressure.labels == {name: "Bone pressure"}
 
 
 def test_time_gain_is_shown_on_as_many_sliders_as_a_console_has():

@@ -21,7 +21,7 @@ from us_sim.settings.spelling import shown
 
 _UNITS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
-    "pressure": {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9},
+    "pressure": {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "mmHg": 133.322},
     "density": {"kg/m3": 1.0, "kg/m^3": 1.0, "g/cm3": 1e3},
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6},
     "angle": {"rad": 1.0, "deg": math.pi / 180, "°": math.pi / 180},
@@ -177,6 +177,8 @@ def dial_unit(quantity: Quantity) -> str:
         return "MHz"
     if dimension == "speed" and quantity.maximum <= 5.0:  # of blood
         return "cm/s"
+    if dimension == "pressure" and quantity.maximum <= 1e5:  # of blood
+        return "mmHg"
     handy = _HANDY.get(dimension, (quantity.unit,))[0]
     return _ON_A_DIAL.get(dimension, handy)
 

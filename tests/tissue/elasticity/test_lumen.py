@@ -314,12 +314,13 @@ def test_a_pressed_lumen_in_a_block_empties_and_fills_again():
 
 
 @pytest.mark.parametrize(
-    ("pressure", "found"), [(-100.0, "-100 Pa"), (np.nan, "nan"), ("8 mmHg", "8 mmHg")]
+    ("pressure", "found"), [(-100.0, "-100 Pa"), (np.nan, "nan"), ("8 cmH2O", "8 cmH2O")]
 )
 def test_a_pressure_that_cannot_be_is_refused(pressure, found):
     with pytest.raises(MaterialError, match=f"material.lumen_pressure: .*{found}"):
         Material(5e3, 0.1, 1000.0, lumen_pressure=pressure)
     assert Material(5e3, lumen_pressure="1.3 kPa").lumen_pressure == 1300.0
+    assert Material(5e3, lumen_pressure="8 mmHg").lumen_pressure == pytest.approx(1066.6, abs=0.1)
 
 
 @pytest.mark.parametrize(

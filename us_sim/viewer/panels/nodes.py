@@ -36,7 +36,7 @@ COMMON = (
 STATUS_S = 0.5  # how often states are brought up to date
 TISSUE = "tissue_deformer"
 METHOD = ("solver", "compare_with")
-MATERIALS, STIFFNESS = "materials.", ".young_modulus"
+MATERIALS, STIFFNESS, PRESSURE = "materials.", ".young_modulus", ".lumen_pressure"
 RECENT_S = 20.0  # how long it is said that a setting was set back
 PROBLEM_S = 60.0  # how long the last problem of a node that is well again is shown
 HELD_BACK_S = 0.15
@@ -52,14 +52,19 @@ def build_image(simulator: Simulator) -> None:
 
 
 def arrange_tissue(parameters: Mapping[str, Parameter]) -> list[Section]:
-    """Put the method first, the settings of those in use, and the structures' stiffness."""
-    labels = {
-        name: title_of(name[len(MATERIALS) : -len(STIFFNESS)])
-        for name in parameters
-        if name.startswith(MATERIALS) and name.endswith(STIFFNESS)
-    }
-    stiffness = Section("Young's modulus", tuple(labels), labels, is_open=True)
-    return arrange(parameters, choosing=METHOD, ahead=[stiffness])
+    """Put the method first, the settings of those in use, then stiffness and blood's pressure."""
+
+    def labels(ending: str, more: str = "") -> dict[str, str]:
+        return {
+            name: title_of(name[len(MATERIALS) : -len(ending)]) + more
+            for name, parameter in parameters.items()
+            if name.startswith(MATERIALS) and name.endswith(ending) and parameter.value is not None
+        }
+
+    stiff, pressed = labels(STIFFNESS), labels(PRESSURE, " pressure")
+    stiffness = Section("Young's modulus", tuple(stiff), stiff, is_open=True)
+    pressure = Section("Pressure of blood", tuple(pressed), pressed, is_open=True)
+    return arrange(parameters, choosing=METHOD, ahead=[stiffness, pressure])
 
 
 def build_tissue(simulator: Simulator) -> None:
