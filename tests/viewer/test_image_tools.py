@@ -122,6 +122,12 @@ def test_distances_are_right_to_a_tenth_of_a_millimetre(
     assert float(value.split()[0]) == pytest.approx(math.dist(start, end), abs=0.1)
 
 
+def test_a_point_that_is_dragged_out_of_the_image_stays_at_its_border(page: Any) -> None:
+    page.keyboard.press("d")
+    drag(page, at(page, 0, 10), at(page, 0, 60))
+    assert values(page) == ["32.0 mm"]  # 300 rows end at 42 mm
+
+
 def test_several_distances_and_their_ends_can_be_dragged(page: Any) -> None:
     for depth, length in ((8, 10), (20, 6)):
         page.get_by_role("button", name="Distance", exact=True).click()
@@ -444,6 +450,7 @@ def test_the_last_seconds_are_saved_as_they_are_seen(
     with page.expect_download() as download:
         page.keyboard.press("p")
     assert download.value.suggested_filename.endswith(f".{ending}")
+    page.get_by_role("button", name="Freeze").wait_for()  # the page goes on
     file = tmp_path / f"loop.{ending}"
     download.value.save_as(file)
     assert file.read_bytes().startswith(begins)

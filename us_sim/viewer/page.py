@@ -144,6 +144,8 @@ class ModeBar:
         force = (tissue.number("force") if tissue else None) or 0.0
         if force > 20.0:  # N; sonographers press with some 5 to 10
             remarks.append(f"Too much force: {force:.0f} N")
+        if tissue and tissue.values.get("problem") == "inside out":
+            remarks.append(tissue.message.partition(" (")[0])
         if self._mode == "velocity":
             remarks.append(_absent("No colour", values.get("no_colour", ""), values))
         if self._strips["spectrum"]:

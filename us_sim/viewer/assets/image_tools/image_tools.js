@@ -81,8 +81,6 @@ bar.append(saved);
 
 async function saveChosen() {
   if (saving.disabled || !hasImage()) return;
-  const [, , { isLoop = false } = {}] = KINDS[kinds.value];
-  if (isLoop) freeze.hold();
   saving.disabled = true;
   saving.textContent = "Saving …";
   try {

@@ -127,7 +127,7 @@ sheet.addEventListener("pointerdown", (event) => {
   const map = plane();
   if (event.button !== 0 || !map) return;
   if (tool) {
-    const point = map.toPlane(at(event));
+    const point = map.toImage(at(event));
     const measure = begin(point);
     if (measure instanceof Note) {
       event.preventDefault();
@@ -152,7 +152,7 @@ sheet.addEventListener("pointerdown", (event) => {
 sheet.addEventListener("pointermove", (event) => {
   if (!drag) return;
   const [x, y] = at(event);
-  drag.measure.move(drag.index, plane().toPlane([x + drag.offset[0], y + drag.offset[1]]));
+  drag.measure.move(drag.index, plane().toImage([x + drag.offset[0], y + drag.offset[1]]));
   draw();
 });
 
@@ -175,7 +175,7 @@ sheet.addEventListener("keydown", (event) => {
     const map = plane();
     const [x, y] = map.toScreen(measure.points[index]);
     const [dx, dy] = STEPS[event.key].map((way) => way * (event.shiftKey ? FAR : NUDGE));
-    measure.move(index, map.toPlane([x + dx, y + dy]));
+    measure.move(index, map.toImage([x + dx, y + dy]));
   } else return;
   event.preventDefault();
   event.stopPropagation();

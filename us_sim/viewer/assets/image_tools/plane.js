@@ -2,7 +2,10 @@
 
 import { hasImage, imageBox, imageCanvas, pixelToMillimetres } from "../image.js";
 
-/** The affine map of now: {toScreen([mm, mm]) -> [CSS px, CSS px] in `#ultrasound`, toPlane}. */
+/**
+ * The affine map of now: {toScreen([mm, mm]) -> [CSS px, CSS px] in `#ultrasound`, toPlane}, and
+ * toImage, which is toPlane of the nearest place in the image.
+ */
 export function plane() {
   const origin = pixelToMillimetres(0, 0);
   const { width: columns, height: rows } = imageCanvas();
@@ -21,6 +24,10 @@ export function plane() {
     toPlane(at) {
       const [column, row] = toPixels(at);
       return [ox + ax * column + bx * row, oy + ay * column + by * row];
+    },
+    toImage([x, y]) {
+      const within = (value, low, size) => Math.min(Math.max(value, low), low + size);
+      return this.toPlane([within(x, box.left, box.width), within(y, box.top, box.height)]);
     },
     toScreen([x, y]) {
       const column = (by * (x - ox) - bx * (y - oy)) / determinant;
