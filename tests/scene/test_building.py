@@ -115,7 +115,7 @@ def test_labels_that_are_not_there_are_named(organ):
         origin="my.yaml",
     )
     with pytest.raises(SceneError, match=r"my.yaml: structures.stone: .*`kidney`.*skin, "):
-        require_labels(unknown, volume)
+        require_labels(unknown, volume.label_names)
 
 
 def test_a_mesh_in_the_wrong_unit_or_of_a_surface_is_refused(organ, folder):

@@ -84,6 +84,22 @@ def test_a_recording_in_place_of_a_tracker_is_read_too(tmp_path):
         check_files(load_scene(file))
 
 
+@pytest.mark.parametrize(
+    ("more", "found"),
+    [
+        ("structures: {{kidney: {{}}}}", r"structures\.kidney: the volume has no label `kidney`"),
+        ("exercise: {}/kidney.yaml", "exercise: .* is with kidney, which the volume lacks"),
+    ],
+)
+def test_a_structure_that_the_volume_lacks_is_named(tmp_path, more, found):
+    exercise = "name: Find it\ndescription: Find it.\ntask: {kind: centre, structure: kidney}\n"
+    (tmp_path / "kidney.yaml").write_text(exercise, encoding="utf-8")
+    file = tmp_path / "scene.yaml"
+    file.write_text(f"based_on: upper_arm\n{more.format(tmp_path)}\n", encoding="utf-8")
+    with pytest.raises(UsSimError, match=found):
+        check_files(load_scene(file))
+
+
 def test_a_label_without_a_material_is_named_before_the_volume_is_made(tmp_path):
     file = tmp_path / "scene.yaml"
     file.write_text("based_on: upper_arm\ntissue: {materials: {fat: null}}\n", encoding="utf-8")

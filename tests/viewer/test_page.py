@@ -49,7 +49,9 @@ def test_pixels_are_drawn_as_they_were_sent(page: Any, simulator: Simulator) -> 
     assert box["width"] / box["height"] == pytest.approx(512 / 300, rel=1e-3)
 
 
-@pytest.mark.parametrize(("force", "words"), [({}, "no images come"), ({"force_age": 0.7}, "the tissue does not answer")])
+@pytest.mark.parametrize(
+    ("force", "words"), [({}, "no images come"), ({"force_age": 0.7}, "the tissue does not answer")]
+)
 def test_an_image_is_not_said_to_be_still_where_nothing_comes(
     page: Any, simulator: Simulator, force: dict[str, float], words: str
 ) -> None:

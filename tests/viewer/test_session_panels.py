@@ -62,6 +62,7 @@ def test_a_case_is_loaded_and_a_recording_is_not_ended_unasked(page, session):
     page.get_by_role("dialog").get_by_role("button", name="Load").click()
     until(lambda: len(asked) == 2, "it is asked for once more", 30.0)
 
+
 def test_an_exercise_is_not_ended_unasked(page, session, simulator):
     board, asked = session
     board.scenes = (ListedScene("liver", "case:/liver", "case"),)

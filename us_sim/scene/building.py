@@ -184,7 +184,7 @@ def tissue_model_of(
     if section is None:
         raise SceneError(f"{scene.origin}: tissue: is missing")
     if scene.structures:
-        require_labels(scene, volume)
+        require_labels(scene, volume.label_names)
     mesh, remarks, fractions = _mesh(scene, section, volume)
     fixed, held = _fixed_nodes(scene, section, mesh, volume, fractions)
     if note is not None:
@@ -464,13 +464,17 @@ def colour_of(scene: Scene, name: str) -> Colour:
     return given.colour or anatomical_colour(given.label or name)
 
 
-def require_labels(scene: Scene, volume: Volume) -> None:
+def require_labels(scene: Scene, label_names: Mapping[int, str]) -> None:
     """Check that the volume has the labels that the scene's structures are made from.
+
+    Args:
+        scene: with structures.
+        label_names: of the volume's labels, by their numbers; none where it has no labels.
 
     Raises:
         SceneError: it has not.
     """
-    known = volume.label_names.values() if volume.labels is not None else ()
+    known = label_names.values()
     for name, given in scene.structures.items():
         label = given.label or name
         if not given.file and label not in known:
@@ -499,7 +503,7 @@ def structures_of(
     """
     from us_sim.tissue.mesh.embedding import EmbeddedSurface
 
-    require_labels(scene, volume)
+    require_labels(scene, volume.label_names)
     numbers = {name: label for label, name in volume.label_names.items()}
     labels = {
         name: numbers[given.label or name]
@@ -546,7 +550,7 @@ def blood_of(scene: Scene, volume: Volume) -> Blood:
     from us_sim.slicing.flow.blood import Blood
     from us_sim.slicing.flow.vessel import Vessel
 
-    require_labels(scene, volume)
+    require_labels(scene, volume.label_names)
     numbers = {name: label for label, name in volume.label_names.items()}
     vessels = []
     for name, flow in scene.flows.items():

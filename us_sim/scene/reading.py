@@ -27,6 +27,7 @@ from us_sim.scene.building import (
     camera_body_of,
     path_of,
     probe_of,
+    require_labels,
     require_materials,
     source_settings,
     tracking_of,
@@ -176,8 +177,11 @@ def check_files(scene: Scene) -> list[str]:
         if case.has_labels:
             case.check_grids()
         checked.append("volume.case (its headers)")
+    label_names = _label_names(scene)
+    if label_names is not None:
+        require_labels(scene, label_names)
     if scene.tissue is not None:
-        require_materials(scene, scene.tissue.materials, _label_names(scene))
+        require_materials(scene, scene.tissue.materials, label_names)
     if scene.tissue is not None and scene.tissue.mesh.file:
         checked.append(f"tissue.mesh.file ({'; '.join(_mesh_remarks(scene.tissue))})")
     surfaces = {f"structures.{name}.file": s.file for name, s in scene.structures.items()}
@@ -205,7 +209,13 @@ def check_files(scene: Scene) -> list[str]:
     if scene.exercise:
         from us_sim.scoring.exercise import read_exercise
 
-        read_exercise(scene.exercise)
+        lacking = {*read_exercise(scene.exercise).assigned.structures}
+        lacking -= {*(lacking if label_names is None else label_names.values())}
+        if lacking:
+            raise SceneError(
+                f"{scene.origin}: exercise: {scene.exercise} is with {min(lacking)}, which the "
+                f"volume lacks"
+            )
         checked.append("exercise")
     if scene.path:
         from us_sim.recording.path import read_path
