@@ -62,7 +62,7 @@ def test_task_steps_and_score_are_shown_begun_anew_and_saved(page, simulator):
     page.get_by_text("More", exact=True).click()
     page.get_by_text("Path Length, mm").wait_for()
     page.get_by_role("button", name="Begin anew").click()
-    page.get_by_role("button", name="Erase it").click()
+    page.get_by_role("dialog").get_by_role("button", name="Begin anew").click()
     until(lambda: scorer.asked == ["clear"], "it is asked for")
     scorer.say({**step, "state": "done"} for step in STEPS)
     page.get_by_text("passed: 2 of 2 done, 12 s", exact=True).wait_for()

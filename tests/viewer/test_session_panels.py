@@ -68,6 +68,7 @@ def test_an_exercise_is_not_ended_unasked(page, session, simulator):
     board.scenes = (ListedScene("liver", "case:/liver", "case"),)
     step = {"what": "press", "seen": "", "state": "to do"}
     header = {"name": "compression", "description": "", "scene": "upper_arm", "metrics": {}}
+    header |= {"state": "running", "plain": {}, "about": {}, "faults": []}
     simulator.add(Feed("score"))
     simulator.feeds["score"].offer(lambda n: Packet("score", n, {**header, "steps": [step]}, b""))
     page.goto(page.address)

@@ -43,7 +43,7 @@ class Simulation:
         self._bags_at = 0.0
         self._bags: dict[str, str] = {}
         self._problem = ""
-        self._control = supervisor.control(self, self._shown())
+        self._control = supervisor.control(self.check, self.take, self._shown())
 
     def update(self) -> None:
         """Update as `Supervisor.update`, and continue pending requests.

@@ -30,10 +30,9 @@ from us_sim.settings.spelling import counted
 if TYPE_CHECKING:
     from rclpy.node import Node
 
-    from us_sim.nodes.session_control import SessionControl
+    from us_sim.nodes.session_control import SessionControl, Use
     from us_sim.nodes.session_monitor import SessionMonitor
     from us_sim.nodes.settings import SessionControlSettings
-    from us_sim.run.simulation import Simulation
 
 IMAGES, IMAGER = "ultrasound/image", "slice_interpolator"
 RECORDER_STOP_S = 10.0  # a recorder may take to end: it writes what it still holds
@@ -167,7 +166,7 @@ class Supervisor:
 
     def control(self, controlled: Simulation, settings: SessionControlSettings) -> SessionControl:
         """Make the node by which a simulation with these settings is controlled."""
-        from us_sim.nodes.session_control import SessionControl
+        from us_sim.nodes.session_control import SessionControl, Use
 
         control = SessionControl(
             controlled.check, controlled.take, settings, context=self.monitor.context

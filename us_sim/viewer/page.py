@@ -20,10 +20,11 @@ from nicegui import ui
 from us_sim.errors import UsSimError
 from us_sim.slicing.settings import OVERLAYS, STRIPS
 from us_sim.viewer.export import LARGEST, exported, frames_of
-from us_sim.viewer.panels.exercise import ExercisePanel, is_blind, told_score
+from us_sim.viewer.panels.exercise import ExercisePanel
 from us_sim.viewer.panels.nodes import build_image, build_plots, build_status, build_tissue
 from us_sim.viewer.panels.session import CasesPanel, SessionPanel
 from us_sim.viewer.parameters import Kind
+from us_sim.viewer.score import is_blind, told_score
 from us_sim.viewer.session import SessionState
 from us_sim.viewer.stream import PageStream, Simulator
 

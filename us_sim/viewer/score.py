@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,20 @@ def score_packet(message: DiagnosticArray, sequence: int) -> Packet:
         "metrics": _values(first),
     }
     return Packet(SCORE, sequence, header, b"")
+
+
+def told_score(simulator: Simulator) -> Mapping[str, Any]:
+    """Return the newest score of the scene that runs; empty where there is none."""
+    feed, state = simulator.feeds.get(SCORE), simulator.session.state
+    packet = feed.newest() if feed is not None else None
+    is_other = packet is not None and state.is_there and packet.header["scene"] != state.scene
+    return {} if packet is None or is_other else packet.header
+
+
+def is_blind(told: Mapping[str, Any]) -> bool:
+    """Return whether nothing may be shown of a score's scene that a scanner does not show."""
+    is_hidden = told.get("about", {}).get("feedback") == "afterwards"
+    return is_hidden and told["state"] not in ("passed", "not passed")
 
 
 def _values(status: DiagnosticStatus) -> dict[str, str]:

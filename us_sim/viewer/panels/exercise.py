@@ -12,9 +12,8 @@ from nicegui import ui
 from us_sim.scene.listing import ListedScene
 from us_sim.scoring.settings import ANSWERS, NO_ANSWER, NO_THROMBUS, STATES
 from us_sim.viewer.panels.controls import WhileShown
-from us_sim.viewer.remote_parameters import in_time
-from us_sim.viewer.score import PICTURE, SCORE
-from us_sim.viewer.session import CONTROL
+from us_sim.viewer.panels.session import is_sure, load_asked
+from us_sim.viewer.score import PICTURE, SCORE, is_blind, told_score
 from us_sim.viewer.stream import Feed, Simulator
 
 EVERY_S = 0.5
@@ -129,24 +128,8 @@ class ExercisePanel:
                 button.set_enabled(state.is_there and not state.is_busy)
 
     async def _load(self, exercise: ListedScene) -> None:
-        if await self._is_sure(f"Loading {exercise.name}"):
-            refused = await in_time(self._board.ask(scene=exercise.origin), CONTROL)
-            if refused:
-                ui.notify(refused, type="warning", multi_line=True)
-            else:
-                self._choice.close()
-
-    async def _is_sure(self, what: str) -> bool:
-        """Ask where an attempt would be erased."""
-        if (self._told or {}).get("state") != "running":
-            return True
-        with ui.dialog() as dialog, ui.card():
-            dialog.props["aria-label"] = "Erase the attempt"
-            ui.label(f"{what} erases the attempt that goes on.")
-            with ui.row():
-                ui.button("Erase it", on_click=lambda: dialog.submit(True)).props("no-caps")
-                ui.button("Go on", on_click=lambda: dialog.submit(False)).props("flat no-caps")
-        return bool(await dialog)
+        if await load_asked(self._simulator, exercise):
+            self._choice.close()
 
     def _show_hint(self, number: int) -> None:
         self._hints.clear()
@@ -220,7 +203,9 @@ class ExercisePanel:
             ui.notify(refused, type="warning", multi_line=True)
 
     async def _clear(self) -> None:
-        if await self._is_sure("Begin anew"):
+        name = (self._told or {}).get("name", "")
+        is_running = (self._told or {}).get("state") == "running"
+        if not is_running or await is_sure("Begin anew", f"It ends the attempt at {name}."):
             self._simulator.ask_scorer("clear")
 
     async def _draw(self) -> bool:
@@ -259,20 +244,6 @@ def _draw_metrics(metrics: Mapping[str, str]) -> None:
     for label, value in metrics.items():
         ui.label(label).classes("us-quiet")
         ui.label(value)
-
-
-def told_score(simulator: Simulator) -> Mapping[str, Any]:
-    """Return the newest score of the scene that runs; empty where there is none."""
-    feed, state = simulator.feeds.get(SCORE), simulator.session.state
-    packet = feed.newest() if feed is not None else None
-    is_other = packet is not None and state.is_there and packet.header["scene"] != state.scene
-    return {} if packet is None or is_other else packet.header
-
-
-def is_blind(told: Mapping[str, Any]) -> bool:
-    """Return whether nothing may be shown of a score's scene that a scanner does not show."""
-    is_hidden = told.get("about", {}).get("feedback") == "afterwards"
-    return is_hidden and told["state"] not in ("passed", "not passed")
 
 
 def _address(picture: bytes) -> str:

@@ -12,8 +12,8 @@ from nicegui import ui
 
 from us_sim.scene.listing import ListedScene
 from us_sim.viewer.panels.controls import WhileShown
-from us_sim.viewer.panels.exercise import told_score
 from us_sim.viewer.remote_parameters import in_time
+from us_sim.viewer.score import told_score
 from us_sim.viewer.session import CONTROL, NOT_THERE, SessionState
 from us_sim.viewer.stream import Simulator
 
@@ -90,36 +90,41 @@ class CasesPanel:
             with ui.row().classes("us-case-foot"):
                 ui.label("loaded" if is_loaded else "").classes("us-accent")
                 button = ui.button(
-                    "Load again" if is_loaded else "Load", on_click=lambda: self._load(scene)
+                    "Load again" if is_loaded else "Load",
+                    on_click=lambda: load_asked(self._simulator, scene),
                 ).props("flat dense no-caps")
                 button.props["aria-label"] = f"Load {scene.name}"
                 button.set_enabled(state.is_there and not state.is_busy and not scene.problem)
                 button.props["title"] = AGAIN if is_loaded else ANOTHER
 
-    async def _load(self, scene: ListedScene) -> None:
-        ends = self._what_ends()
-        if ends and not await self._is_sure(scene, ends):
-            return
-        refused = await in_time(self._board.ask(scene=scene.origin), CONTROL)
-        if refused:
-            ui.notify(refused, type="warning", multi_line=True)
 
-    def _what_ends(self) -> str:
-        """Name what a person does and would lose with the scene."""
-        record, score = self._board.state.record, told_score(self._simulator)
-        ends = [f"the recording {record}, which is kept as it is"] if record else []
-        ends += [f"the attempt at {score['name']}"] if score.get("steps") else []
-        return ", and ".join(ends)
+async def load_asked(simulator: Simulator, scene: ListedScene) -> bool:
+    """Load a scene, and ask first where something ends with the one that runs.
 
-    async def _is_sure(self, scene: ListedScene, ends: str) -> bool:
-        """Ask, since something ends with its scene."""
-        with ui.dialog() as dialog, ui.card():
-            dialog.props["aria-label"] = "Load another scene"
-            ui.label(f"Loading {scene.name} ends {ends}.")
-            with ui.row():
-                ui.button("Load", on_click=lambda: dialog.submit(True)).props("no-caps")
-                ui.button("Go on", on_click=lambda: dialog.submit(False)).props("flat no-caps")
-        return bool(await dialog)
+    Returns:
+        whether it is loaded.
+    """
+    record, score = simulator.session.state.record, told_score(simulator)
+    ends = [f"the recording {record}, which is kept as it is"] if record else []
+    ends += [f"the attempt at {score['name']}"] if score.get("state") == "running" else []
+    sentence = f"Loading {scene.name} ends {', and '.join(ends)}."
+    if ends and not await is_sure("Load", sentence):
+        return False
+    refused = await in_time(simulator.session.ask(scene=scene.origin), CONTROL)
+    if refused:
+        ui.notify(refused, type="warning", multi_line=True)
+    return not refused
+
+
+async def is_sure(what: str, sentence: str) -> bool:
+    """Ask before something ends; whether that shall be."""
+    with ui.dialog() as dialog, ui.card():
+        dialog.props["aria-label"] = what
+        ui.label(sentence)
+        with ui.row():
+            ui.button(what, on_click=lambda: dialog.submit(True)).props("no-caps")
+            ui.button("Go on", on_click=lambda: dialog.submit(False)).props("flat no-caps")
+    return bool(await dialog)
 
 
 def _told(state: SessionState) -> str:
