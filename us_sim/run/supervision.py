@@ -164,13 +164,11 @@ class Supervisor:
         self._listening.callback(node.destroy_node)
         self._listening.callback(self._executor.remove_node, node)
 
-    def control(self, controlled: Simulation, settings: SessionControlSettings) -> SessionControl:
+    def control(self, check: Use, take: Use, settings: SessionControlSettings) -> SessionControl:
         """Make the node by which a simulation with these settings is controlled."""
-        from us_sim.nodes.session_control import SessionControl, Use
+        from us_sim.nodes.session_control import SessionControl
 
-        control = SessionControl(
-            controlled.check, controlled.take, settings, context=self.monitor.context
-        )
+        control = SessionControl(check, take, settings, context=self.monitor.context)
         self._add(control)
         return control
 
