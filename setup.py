@@ -145,7 +145,6 @@ setup(
     ],
     entry_points={
         "console_scripts": console_scripts(),
-        "gymnasium.envs": ["us_sim = us_sim.environment:register"],
     },
     zip_safe=False,
 )

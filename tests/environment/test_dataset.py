@@ -68,7 +68,7 @@ def test_a_shard_holds_what_the_environment_gives(scene, made):
     environment = ScanEnvironment("FindVein", scene)
     environment.reset(seed=facts["seed"])
     for step in steps:
-        state, told = environment.state, json.loads(step["json"])
+        state, told = environment.truth, json.loads(step["json"])
         for name, truth in (("image.png", state.image), ("labels.png", state.labels)):
             coded = np.frombuffer(step[name], np.uint8)
             assert np.array_equal(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), truth)

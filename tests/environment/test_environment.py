@@ -138,6 +138,31 @@ def test_a_wanted_force_is_reached(scene):
     assert info["force"] == pytest.approx(4.0, rel=0.01)
 
 
+@pytest.mark.parametrize(
+    ("solver", "skin"), [("fem", {}), ("fem_nonlinear", None), ("fem_cg", None), ("msds", None)]
+)
+def test_a_restored_state_goes_on_with_the_same_bytes(scene, solver, skin):
+    draws = PLAIN | {"delay": [2, 2], "position_noise": [1e-3, 1e-3], "stiffness": [0.5, 2]}
+    settings = {"tissue": {"solver": solver}, "episode": {"draws": draws, "observe": EVERYTHING}}
+    settings |= {"skin": skin} if skin is None else {}
+    environment = ScanEnvironment("CompressVein", scene=scene, settings=settings)
+
+    def act(x):
+        seen = [environment.step([x, 0, 1, 0, 0, 0]) for _ in range(6)]
+        return [(*(o[name].tobytes() for name in EVERYTHING), r, i) for o, r, _, _, i in seen]
+
+    environment.reset(seed=3)
+    act(0.0)
+    state = environment.state()
+    branch, other = act(0.1), act(-0.5)
+    environment.restore(state)
+    assert act(0.1) == branch
+    environment.reset(seed=4)  # other materials
+    act(0.0)
+    environment.restore(state)
+    assert act(0.1) + act(-0.5) == branch + other
+
+
 def test_an_observation_is_late_by_the_delay(plain):
     def depths(delay):
         first, _ = plain.reset(options={"delay": delay})
@@ -152,7 +177,7 @@ def test_noise_is_as_large_as_it_says(plain):
     plain.reset(seed=1, options={"position_noise": 1e-3})
     seen = np.array([plain.step(STILL)[0]["pose"][:3] for _ in range(100)])
     assert seen.std() == pytest.approx(1e-3, rel=0.2)  # of 300 numbers: 4 %
-    assert np.array_equal(plain.state.pose.position, [0, 0, 0])
+    assert np.array_equal(plain.truth.pose.position, [0, 0, 0])
 
 
 def test_following_the_goal_is_no_error(scene):

@@ -51,7 +51,7 @@ def test_observations_are_what_the_environment_gave_and_truths_are_of_the_moment
         assert state["contact.contact"] == observed["contact"][0]
         assert [state[f"pose.{part}"] for part in "xyz"] == observed["pose"][:3].tolist()
         assert state["wrench.fz"] == observed["wrench"][2]
-        truth = environment.state
+        truth = environment.truth
         assert np.array_equal(frame["truth.labels"], truth.labels)
         assert frame["truth.pose"][:3] == pytest.approx(truth.pose.position)
         assert frame["truth.wrench"] == pytest.approx(truth.wrench, rel=1e-6, abs=1e-12)

@@ -79,7 +79,7 @@ class VisualServo:
 
     def act(self, observation: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
         """(6,) the next action."""
-        image = observation["image"]
+        image = np.squeeze(observation["image"])
         spots = dark_spots(image)
         x, z = getattr(self, f"_{self.phase}")(image, spots)
         self._steps += 1

@@ -332,7 +332,7 @@ def _members(
     environment: ScanEnvironment, observation: Mapping[str, NDArray[Any]], labels: Mapping[int, str]
 ) -> dict[str, Any]:
     """The files of a step by their endings; ``json`` is still a mapping."""
-    state, area = environment.state, environment.simulation.pixel_area
+    state, area = environment.truth, environment.simulation.pixel_area
     members: dict[str, Any] = {"image.png": _png(state.image)}
     step: dict[str, Any] = {
         "pose": [*state.pose.position.tolist(), *state.pose.orientation.tolist()],

@@ -4,26 +4,29 @@
 >>> arm = gymnasium.make("us_sim/FindVein-v0", scene="tests/small_scene.yaml")
 >>> observation, info = arm.reset(seed=1)
 >>> observation["image"].shape, observation["wrench"].shape
-((80, 96), (6,))
+((80, 96, 1), (6,))
 >>> observation, reward, terminated, truncated, info = arm.step(arm.action_space.sample())
 >>> arm.close()
 """
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
-from us_sim.environment.simulation import Draw, Simulation, State
+from us_sim.environment.simulation import Draw, Simulation, SimulationState, State
 from us_sim.environment.tasks import TASKS
 from us_sim.errors import EpisodeError, SceneError
 from us_sim.geometry.pose import Pose
@@ -35,9 +38,12 @@ from us_sim.tracking.robot import approach_speed, kept_within
 
 DEFAULT_SCENE = "upper_arm_learning"
 
-_LARGEST = 1e3
-"""Bound of numbers in SI units, which nothing reaches; spaces without bounds suit few learners."""
-_NUMBERS = ("wrench", "displacement", "strain")
+_SENSOR = np.array([100.0, 100.0, 100.0, 10.0, 10.0, 10.0])
+"""N, N m: range of the sensor that observes the wrench."""
+_FARTHEST = 0.1
+"""m, that tissue is observed to move."""
+_EPISODE = ("draw", "task", "_truth", "_step", "_done", "_late")
+"""Attributes of an environment that belong to the episode, besides its random numbers."""
 
 Observation = dict[str, NDArray[Any]]
 
@@ -47,13 +53,13 @@ def scene_of(
     case: str | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> Scene:
-    """The scene of that name or file, or of a case, with keys of its own changed.
+    """Read the scene of that name or file, or of a case, with keys of its own changed.
 
     Args:
         scene: name or file, or one that was read; `DEFAULT_SCENE` where neither scene nor case is
             given.
         case: name or folder.
-        settings: keys of a scene, as its YAML has them.
+        settings: keys of a scene, as its YAML has them; NumPy's numbers are numbers.
 
     Raises:
         EpisodeError: both a scene and a case are given.
@@ -66,8 +72,17 @@ def scene_of(
     name = f"{CASE_PREFIX}{case}" if case is not None else scene or DEFAULT_SCENE
     document, folders, origin = scene_document(name)
     if settings:
-        document = merged(document, dict(settings))
+        document = merged(document, _plain(settings))
     return parse_scene(document, origin=origin, folders=folders)
+
+
+@dataclass(frozen=True, eq=False)
+class EnvironmentState:
+    """All that decides what comes in an environment, but for its scene and its actions."""
+
+    episode: Mapping[str, Any]  # attributes of the environment
+    random: np.random.Generator
+    simulation: SimulationState
 
 
 class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -111,23 +126,38 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.simulation = Simulation(self.scene)
         self.task = self._task_class(self.simulation)  # refused now rather than at a reset
         self.draw = Draw()
-        self._state: State | None = None
+        self._truth: State | None = None
         self._step = 0
+        self._done = 0.0  # part of the task
         self.action_space = spaces.Box(-1.0, 1.0, (6,), np.float32)
         rows, columns = self.simulation.scanner.probe.rows, self.simulation.scanner.probe.columns
-        entries: dict[str, spaces.Space[Any]] = {
-            "image": spaces.Box(0, 255, (rows, columns), np.uint8),
-            "labels": spaces.Box(0, 255, (rows, columns), np.uint8),
-            "displacement": _numbers(rows, columns, 2),
-            "strain": _numbers(rows, columns),
-            "wrench": _numbers(6),
-            "pose": _numbers(7),
+        # A tracker's noise leads beyond the reach.
+        margin = 6 * np.array(episode.draws.position_noise[1])
+        low = np.array([-episode.aside, -episode.aside, -episode.lift]) - margin
+        high = np.array([episode.aside, episode.aside, episode.press]) + margin
+        entries: dict[str, spaces.Box] = {
+            "image": spaces.Box(0, 255, (rows, columns, 1), np.uint8),
+            "labels": spaces.Box(0, 255, (rows, columns, 1), np.uint8),
+            "displacement": spaces.Box(-_FARTHEST, _FARTHEST, (rows, columns, 2), np.float32),
+            "strain": spaces.Box(-1.0, 1.0, (rows, columns, 1), np.float32),
+            "wrench": _box(-_SENSOR, _SENSOR),
+            "pose": _box([*low, -1, -1, -1, -1], [*high, 1, 1, 1, 1]),
             "contact": spaces.Box(0.0, 1.0, (1,), np.float32),
-            "goal": _numbers(7),
+            "goal": _box([*low, -1, -1, -1, -1], [*high, 1, 1, 1, 1]),
         }
         names = (*episode.observe, *(("goal",) if self.task.has_goal else ()))
-        self._spaces: dict[str, Any] = {name: entries[name] for name in names}
+        self._spaces = {name: entries[name] for name in names}
         self.observation_space: Any = spaces.Dict(self._spaces)
+
+    @property
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+        """What gymnasium knows of this environment, with the number of steps of an episode."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        steps = self._settings.steps
+        self._spec = spec and dataclasses.replace(spec, max_episode_steps=steps)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -144,18 +174,19 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         super().reset(seed=seed)
         draws = self._settings.draws
         given: dict[str, Any] = {}
-        for name, value in (options or {}).items():
+        for name, value in _plain(options or {}).items():
             if name not in vars(draws):
                 raise SceneError(f"options: {unknown(name, vars(draws))}")
-            given[name] = value if isinstance(value, list | tuple) else (value, value)
+            given[name] = value if isinstance(value, list) else (value, value)
         self.draw = Draw.of(dataclasses.replace(draws, **given), self.scene, self.np_random)
         self.simulation.reset(self.draw)
         self.task = self._task_class(self.simulation)
-        self.task.begin(self.draw.start)
-        self._step = 0
+        self._step, self._done = 0, 0.0
         self._late: deque[Observation] = deque(maxlen=self.draw.delay + 1)
-        self._state = self.simulation.step(kept_within(self.draw.start, Pose(), self._settings))
-        return self._observe(), {"draw": self.draw.document()}
+        start = kept_within(self.draw.start, Pose(), self._settings)
+        self._truth = self.simulation.step(start)
+        self.task.begin(self._truth)
+        return self._observe(), self._info()
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Move the probe for one period.
@@ -168,23 +199,17 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         Raises:
             EpisodeError: the action is no six numbers from -1 to 1, or no episode has begun.
         """
-        if self._state is None:
-            raise EpisodeError("no episode has begun: call reset first")
+        before = self.truth
         velocity = self._velocity(_checked(action))
-        moved = self._state.pose @ exp(velocity * self._settings.period)
-        pose = kept_within(moved, self._state.pose, self._settings)
-        self._state = state = self.simulation.step(pose)
+        moved = before.pose @ exp(velocity * self._settings.period)
+        self._truth = self.simulation.step(kept_within(moved, before.pose, self._settings))
         self._step += 1
-        reward, is_done = self.task.judge(state)
+        reward, done = self.task.judge(self._truth)
+        reward = reward / self._settings.steps + done - self._done
+        self._done = done
+        is_done = done == 1.0
         truncated = not is_done and self._step >= self._settings.steps
-        info = {
-            "is_success": is_done,
-            "force": state.force,
-            "is_balanced": state.is_balanced,
-            **self.task.facts(),
-        }
-        reward = reward / self._settings.steps + float(is_done)
-        return self._observe(), reward, is_done, truncated, info
+        return self._observe(), reward, is_done, truncated, self._info()
 
     def render(self) -> Any:
         """(rows, columns, 3) the image as red, green and blue; None without a render mode.
@@ -194,45 +219,71 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         """
         if self.render_mode is None:
             return None
-        if self._state is None:
-            raise EpisodeError("no episode has begun, so there is no image: call reset first")
-        return np.repeat(self._state.image[..., None], 3, axis=2)
+        return np.repeat(self.truth.image[..., None], 3, axis=2)
 
     @property
-    def state(self) -> State:
-        """The truth of the last step.
+    def truth(self) -> State:
+        """Truth of the last step.
 
         Raises:
             EpisodeError: no episode has begun.
         """
-        if self._state is None:
+        if self._truth is None:
             raise EpisodeError("no episode has begun: call reset first")
-        return self._state
+        return self._truth
+
+    def state(self) -> EnvironmentState:
+        """Copy all that decides what comes, so that `restore` can go on from here.
+
+        Raises:
+            EpisodeError: no episode has begun.
+        """
+        _ = self.truth
+        episode = {name: copy.copy(getattr(self, name)) for name in _EPISODE}
+        return EnvironmentState(episode, copy.deepcopy(self.np_random), self.simulation.state())
+
+    def restore(self, state: EnvironmentState) -> None:
+        """Go on from a state of this environment, as often as is wanted."""
+        self.simulation.restore(state.simulation)
+        self.np_random = copy.deepcopy(state.random)
+        for name, value in state.episode.items():
+            setattr(self, name, copy.copy(value))
+
+    def _info(self) -> dict[str, Any]:
+        force = self.truth.force
+        return {
+            "is_success": self._done == 1.0,
+            "force": force,
+            "cost": max(force - self._settings.force, 0.0),
+            "is_balanced": self.truth.is_balanced,
+            "draw": self.draw.document(),
+            **self.task.facts(),
+        }
 
     def _velocity(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(6,) m/s, rad/s in the probe's frame."""
+        """Return (6,) m/s, rad/s in the probe's frame."""
         given = self._settings
         velocity = action * np.repeat([given.speed, given.angular_speed], 3)
         if given.control == "force":
             wanted = 0.5 * (action[2] + 1.0) * given.force
             damping = given.force_error / given.speed
-            velocity[2] = approach_speed(wanted, self.state.force, damping, given.speed)
+            velocity[2] = approach_speed(wanted, self.truth.force, damping, given.speed)
         return velocity
 
     def _observe(self) -> Observation:
-        state, draw, made = self.state, self.draw, {}
+        state, draw, made = self.truth, self.draw, {}
         # Taken always, so that what is observed decides no byte of what comes.
         noise = self.np_random.standard_normal(6)
         noise *= np.repeat([draw.position_noise, draw.orientation_noise], 3)
         for name, space in self._spaces.items():
             if name == "pose":
-                made[name] = _seven(state.pose @ exp(noise))
+                value: Any = _seven(state.pose @ exp(noise))
             elif name == "goal":
-                made[name] = _seven(self.task.goal(self._step))
+                value = _seven(self.task.goal(self._step))
             else:
                 value = getattr(state, name)
-                limited = np.clip(value, -_LARGEST, _LARGEST) if name in _NUMBERS else value
-                made[name] = np.asarray(limited, space.dtype).reshape(space.shape)
+            limited = np.asarray(value, space.dtype).reshape(space.shape)
+            made[name] = limited.clip(space.low, space.high)
         self._late.append(made)
         return {name: value.copy() for name, value in self._late[0].items()}
 
@@ -266,10 +317,19 @@ def _checked(action: ArrayLike) -> NDArray[np.float64]:
     return np.clip(numbers, -1.0, 1.0)
 
 
-def _numbers(*shape: int) -> spaces.Box:
-    return spaces.Box(-_LARGEST, _LARGEST, shape, np.float32)
+def _box(low: ArrayLike, high: ArrayLike) -> spaces.Box:
+    return spaces.Box(np.asarray(low, np.float32), np.asarray(high, np.float32))
 
 
-def _seven(pose: Pose) -> NDArray[np.float32]:
-    """Position (m) and quaternion x, y, z, w."""
-    return np.concatenate([pose.position, pose.orientation]).astype(np.float32)
+def _seven(pose: Pose) -> NDArray[np.float64]:
+    """Return position (m) and quaternion x, y, z, w."""
+    return np.concatenate([pose.position, pose.orientation])
+
+
+def _plain(value: Any) -> Any:
+    """Return mappings, lists and numbers with NumPy's as Python's."""
+    if isinstance(value, Mapping):
+        return {key: _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    return value.tolist() if isinstance(value, np.generic | np.ndarray) else value

@@ -14,11 +14,12 @@ counted in iterations and on one thread, so that the same poses give the same by
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,7 @@ from us_sim.scene.episode import Draws
 from us_sim.scene.scene import Scene
 from us_sim.scoring.lumen import lifted
 from us_sim.settings.registry import SOLVERS
+from us_sim.skin.membrane import SkinMembrane
 from us_sim.slicing.acoustics.surface_echo import surface_normals_of
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.frame import Frame
@@ -145,6 +147,17 @@ class State:
         return np.nan_to_num(self.strains.image(self.frame))
 
 
+@dataclass(frozen=True, eq=False)
+class SimulationState:
+    """All that decides what a simulation gives for a pose."""
+
+    draw: Draw
+    solver: TissueSolver | None
+    membrane: SkinMembrane | None
+    wrench: NDArray[np.float64]
+    number: int  # of poses so far
+
+
 class Simulation:
     """The tissue, the skin and the scanner of a scene, as a draw changes them.
 
@@ -195,7 +208,7 @@ class Simulation:
         Raises:
             UsSimError: something cannot be made.
         """
-        draw = draw or Draw()
+        self._draw = draw = draw or Draw()
         with self._blas.limit(limits=1, user_api="blas"):
             shape = draw.speckle, draw.thickness
             materials = *shape, draw.lumen_pressure, dict(draw.stiffness)
@@ -237,6 +250,18 @@ class Simulation:
         self._number += 1
         is_balanced = deformation is None or deformation.is_balanced
         return State(pose, frame, self._wrench, is_balanced, self._strains)
+
+    def state(self) -> SimulationState:
+        """Copy where tissue and skin are, so that `restore` can go on from here."""
+        moving = _copied(self._solver), _copied(self._membrane)
+        return SimulationState(self._draw, *moving, self._wrench, self._number)
+
+    def restore(self, state: SimulationState) -> None:
+        """Go on from a state of this simulation, as often as is wanted."""
+        if state.draw is not self._draw:
+            self.reset(state.draw)
+        self._solver, self._membrane = _copied(state.solver), _copied(state.membrane)
+        self._wrench, self._number = state.wrench, state.number
 
     def labels_at_rest(self, pose: Pose) -> NDArray[np.uint8]:
         """(rows, columns) labels in the plane of a pose if the probe did not press."""
@@ -296,6 +321,19 @@ class Simulation:
                 del self._volumes[oldest], self._normals[oldest]
             self._volumes[speckle] = volume, model, fractions
         return self._volumes[speckle]
+
+
+T = TypeVar("T")
+
+
+def _copied(moving: T) -> T:
+    """Copy what moves, but not the frozen dataclasses in it, such as the model."""
+    constants = [
+        value
+        for value in getattr(moving, "__dict__", {}).values()
+        if dataclasses.is_dataclass(value) and value.__dataclass_params__.frozen  # type: ignore
+    ]
+    return copy.deepcopy(moving, {id(constant): constant for constant in constants})
 
 
 def _deeper(mesh: TetrahedralMesh, factor: float) -> TetrahedralMesh:

@@ -1,6 +1,6 @@
 """Tasks of `us_sim.environment`: reward and success, from the truth that a simulator knows.
 
-The rewards of an episode's steps sum to between -1 and 0; success adds 1.
+The rewards of an episode's steps sum to between -1 and 0; what is done of the task adds up to 1.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ _HARDLY_CUT = 0.1
 """Part of its largest cross-section at rest in the episode below which a vessel is not in view."""
 _TOUCHING = 0.9
 """Part of the face that touches."""
+_CLOSED = 0.4
+"""Part of compressing a vein that is done once it was closed."""
 
 
 class Task(ABC):
@@ -36,23 +38,23 @@ class Task(ABC):
         self._simulation = simulation
         self._held = 0  # steps in a row
 
-    def begin(self, start: Pose) -> None:  # noqa: B027 - most tasks begin alike
-        """Begin with the probe at ``start``."""
+    def begin(self, state: State) -> None:  # noqa: B027 - most tasks begin alike
+        """Begin with the probe where an episode starts."""
 
     @abstractmethod
-    def judge(self, state: State) -> tuple[float, bool]:
-        """The reward of a step, -1 to 0, and whether the task is done."""
+    def judge(self, state: State) -> tuple[float, float]:
+        """Return a step's reward, -1 to 0, and the part of the task that is done, 0 to 1."""
 
     def goal(self, step: int) -> Pose:  # noqa: ARG002
-        """The pose to be at, where the task has one."""
+        """Return the pose to be at, where the task has one."""
         return Pose()
 
     def facts(self) -> dict[str, float]:
-        """Truths of the last step, for a person or a data set."""
+        """Return truths of the last step, for a person or a data set."""
         return {}
 
     def _hold(self, is_right: bool, steps: int) -> bool:
-        """Whether this and the last steps were right."""
+        """Return whether this and the last steps were right."""
         self._held = self._held + 1 if is_right else 0
         return self._held >= steps
 
@@ -65,7 +67,11 @@ class _VesselTask(Task):
         self._label = simulation.label(simulation.scene.episode.target)
         self._largest = 0.0  # m²
         self.fraction = 1.0  # of the area at rest
-        self.offset: float | None = None  # m, of the vessel from the image's middle; None unseen
+        self.offset = np.nan  # m, of the vessel from the image's middle; NaN unseen
+
+    def begin(self, state: State) -> None:
+        """Look for the vessel."""
+        self._look(state)
 
     def _look(self, state: State) -> None:
         area = self._simulation.pixel_area
@@ -75,7 +81,7 @@ class _VesselTask(Task):
         self._largest = max(self._largest, at_rest)
         is_cut_off = bool(rest[:, [0, -1]].any())
         if at_rest <= _HARDLY_CUT * self._largest or is_cut_off:
-            self.fraction, self.offset = 1.0, None
+            self.fraction, self.offset = 1.0, np.nan
             return
         self.fraction = float(now.sum()) * area / at_rest
         columns = np.nonzero(now if now.any() else rest)[1]
@@ -84,9 +90,8 @@ class _VesselTask(Task):
         self.offset = float((columns.mean() - middle) * probe.pixel_spacing[0])
 
     def facts(self) -> dict[str, float]:
-        """Area over that at rest, and the offset (m) of what is in view."""
-        seen = {} if self.offset is None else {"target_offset": self.offset}
-        return {"target_area_fraction": self.fraction, **seen}
+        """Return the area over that at rest, and the offset (m), NaN where it is not in view."""
+        return {"target_area_fraction": self.fraction, "target_offset": self.offset}
 
 
 class FindVein(_VesselTask):
@@ -94,15 +99,15 @@ class FindVein(_VesselTask):
 
     in_short = "the vein within 2 mm of the image's middle, open, the face in contact, for 10 steps"
 
-    def judge(self, state: State) -> tuple[float, bool]:
-        """The nearer the more; half of it is for contact that leaves the vein open."""
+    def judge(self, state: State) -> tuple[float, float]:
+        """Reward nearness, and by another half contact that leaves the vein open."""
         self._look(state)
         half = self._simulation.scanner.probe.width / 2
-        distance = half if self.offset is None else min(abs(self.offset), half)
+        distance = float(np.fmin(abs(self.offset), half))
         is_open = self.fraction >= _OPEN
         is_right = distance <= 2e-3 and is_open and state.contact >= _TOUCHING
         reward = -0.5 * distance / half - 0.5 * (1.0 - state.contact * is_open)
-        return reward, self._hold(is_right, 10)
+        return reward, float(self._hold(is_right, 10))
 
 
 class CompressVein(_VesselTask):
@@ -114,18 +119,22 @@ class CompressVein(_VesselTask):
         super().__init__(simulation)
         self.is_closed = False  # at some time in the episode
 
-    def judge(self, state: State) -> tuple[float, bool]:
-        """The less of the vein is open, and once it was closed, the less force."""
+    def judge(self, state: State) -> tuple[float, float]:
+        """Reward less of the vein, and once it was closed, less force.
+
+        Whoever gets further always returns more: without closure at most -0.25, with it -0.1 to
+        0.4, and 0.5 to 1 once it is let go.
+        """
         self._look(state)
         if not self.is_closed:
-            shut = self.offset is not None and self.fraction <= WALLS_TOUCH
-            self.is_closed = self._hold(shut, 5)
-            return -min(self.fraction, 1.0), False
+            self.is_closed = self._hold(self.fraction <= WALLS_TOUCH, 5)
+            return -0.25 - 0.25 * min(self.fraction, 1.0), _CLOSED * self.is_closed
         let_go = state.force < 1.0 and self.fraction >= _OPEN
-        return -min(state.force / 20.0, 1.0), let_go
+        limit = self._simulation.scene.episode.force
+        return -0.25 * min(max(state.force, 0.0) / limit, 1.0), 1.0 if let_go else _CLOSED
 
     def facts(self) -> dict[str, float]:
-        """Also whether the vein was closed."""
+        """Add whether the vein was closed."""
         return super().facts() | {"closed": float(self.is_closed)}
 
 
@@ -134,10 +143,11 @@ class HoldContact(Task):
 
     in_short = "4 N along the probe's axis, within 20 %, the face in contact, for 60 steps"
 
-    def judge(self, state: State) -> tuple[float, bool]:
-        """The nearer to the force, the more."""
+    def judge(self, state: State) -> tuple[float, float]:
+        """Reward nearness to the force."""
         error = abs(state.force - 4.0) / 4.0
-        return -min(error, 1.0), self._hold(error <= 0.2 and state.contact >= _TOUCHING, 60)
+        is_right = error <= 0.2 and state.contact >= _TOUCHING
+        return -min(error, 1.0), float(self._hold(is_right, 60))
 
 
 class FollowPlane(Task):
@@ -156,26 +166,26 @@ class FollowPlane(Task):
         self._corners = np.array([[-x, 0.0, 0.0], [x, 0.0, 0.0], [-x, 0.0, z], [x, 0.0, z]])
         self._start, self._step, self._error = Pose(), 0, 0.0
 
-    def begin(self, start: Pose) -> None:
-        """The plane begins under the start, pressed by 2 mm and upright."""
-        self._start = Pose(np.array([start.position[0], start.position[1], 2e-3]))
+    def begin(self, state: State) -> None:
+        """Begin under the probe, pressed by 2 mm and upright."""
+        self._start = Pose(np.array([*state.pose.position[:2], 2e-3]))
 
     def goal(self, step: int) -> Pose:
-        """The plane's pose at a step."""
+        """Return the plane's pose at a step."""
         part = min(step / 200, 1.0)
         turn = np.array([0.0, 0.0, np.deg2rad(10.0) * part])
         return self._start @ Pose(np.array([0.0, 10e-3 * part, 0.0]), rotation_exp(turn))
 
-    def judge(self, state: State) -> tuple[float, bool]:
-        """The nearer to the plane, the more."""
+    def judge(self, state: State) -> tuple[float, float]:
+        """Reward nearness to the plane."""
         self._step += 1
         apart: NDArray[np.float64] = self.goal(self._step).apply(self._corners)
         apart = apart - state.pose.apply(self._corners)
         self._error = float(np.linalg.norm(apart, axis=1).max())
-        return -min(self._error / 0.02, 1.0), self._hold(self._error <= 2e-3, 60)
+        return -min(self._error / 0.02, 1.0), float(self._hold(self._error <= 2e-3, 60))
 
     def facts(self) -> dict[str, float]:
-        """The largest distance (m) of a corner from where it should be."""
+        """Return the largest distance (m) of a corner from where it should be."""
         return {"plane_error": self._error}
 
 

@@ -8,6 +8,8 @@ geometric part, and gives the elements the nodes' share of the bulk stiffness.
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
@@ -51,6 +53,10 @@ class FactoredStiffness:
         column = np.broadcast_to(rows.reshape(-1, 1, 12), shape).ravel()
         self._kept = (row >= 0) & (column >= 0)
         self._row, self._column = row[self._kept], column[self._kept]
+
+    def __deepcopy__(self, _: object) -> FactoredStiffness:
+        """Share all arrays and the factor, which are replaced and never changed."""
+        return copy.copy(self)
 
     def prepare(
         self,
