@@ -97,6 +97,7 @@ setup(
         "zstandard>=0.22",
     ],
     extras_require={
+        "baselines": [GYMNASIUM, "stable-baselines3>=2.6"],
         "dicom": [
             "pillow>=10",
             "pydicom>=3.0",

@@ -5,7 +5,11 @@ import io
 import json
 import resource
 import socket
+import subprocess
+import sys
 import tarfile
+import time
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -90,7 +94,8 @@ def test_the_same_command_makes_only_what_is_missing(scene, made, monkeypatch, c
     assert make(scene, made, "--task", "FindVein") == 0
     assert [order.name for order, _ in seen] == ["00-short-000002"]
     assert digests(made) == before
-    assert "18 images in 3 episodes" in capsys.readouterr().out
+    assert "18 images in 3 episodes, 0 of them with the task done" in capsys.readouterr().out
+    assert json.loads((made / "manifest.json").read_text())["successes"] == 0
 
 
 def test_another_data_set_or_folder_is_refused(scene, made, tmp_path, capsys):
@@ -124,6 +129,25 @@ def test_an_episode_that_fails_is_told_and_the_others_go_on(scene, tmp_path, mon
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_workers_end_with_the_process_that_is_killed(scene, tmp_path):
+    words = "dataset", scene, "--episodes", "500", "--out", str(tmp_path / "set"), "--workers", "2"
+    process = subprocess.Popen([sys.executable, "-m", "us_sim", *words])
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    while not list(tmp_path.glob("set/*.tar")):
+        assert process.poll() is None
+        time.sleep(0.1)
+    begun = [Path("/proc", number) for number in children.read_text().split()]
+    process.kill()
+    process.wait()
+    end = time.monotonic() + 10.0
+    while any(child.exists() for child in begun):
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    assert len(begun) >= 2
+
+
+@pytest.mark.slow
 def test_a_full_disk_is_one_sentence_and_the_command_goes_on_later(scene, tmp_path, capsys):
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, limit[1]))  # of a file, as a disk's end
@@ -142,6 +166,8 @@ def test_a_full_disk_is_one_sentence_and_the_command_goes_on_later(scene, tmp_pa
     [
         (["--task", "FindVien"], "--task: 'FindVien' is not one of"),
         (["--episodes", "0"], "--episodes: 0 is outside 1 to"),
+        (["--set", "tissue.solver"], "--set tissue.solver: write KEY=VALUE"),
+        (["--set", "tissue.solver=fme"], "tissue.solver: 'fme' is not one of"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(scene, tmp_path, capsys, options, said):

@@ -163,6 +163,64 @@ def test_a_restored_state_goes_on_with_the_same_bytes(scene, solver, skin):
     assert act(0.1) + act(-0.5) == branch + other
 
 
+def furthest(environment, seed, policy):
+    """The return of an episode of a policy that goes on as far as to its own end."""
+    _, info = environment.reset(seed=seed)
+    total, ended = 0.0, False
+    while not ended:
+        speed = 1.0
+        if policy == "hover" or (policy == "touch" and info["force"] > 0.2):
+            speed = 0.0
+        elif info["closed"]:
+            speed = -1.0 if policy == "release" else 0.0
+        _, reward, done, truncated, info = environment.step([0, 0, speed, 0, 0, 0])
+        total, ended = total + reward, done or truncated
+    assert info["is_success"] == (policy == "release")
+    assert info["closed"] == (policy in ("close", "release"))
+    return total
+
+
+@pytest.mark.parametrize("arms", [2, pytest.param(20, marks=pytest.mark.slow)])
+def test_who_gets_further_in_compressing_the_vein_returns_more(scene, arms):
+    settings = {"tissue": {"solver": "fem"}, "episode": {"steps": 80}}
+    if arms == 2:
+        straight = {"lateral": [0, 0], "tilt": [0, 0]}
+        settings |= {"episode": {"steps": 80, "press": 0.024, "draws": straight}}
+    environment = ScanEnvironment("CompressVein", scene if arms == 2 else None, settings=settings)
+    for seed in range(arms):
+        policies = "hover", "touch", "close", "release"
+        returns = [furthest(environment, seed, policy) for policy in policies]
+        assert all(np.diff(returns) > 0.0), (seed, returns)
+
+
+def test_learners_are_told_bounds_channels_and_the_length_of_an_episode(scene):
+    settings = {"tissue": {"solver": "fem"}, "episode": {"steps": np.int64(7), "force": 1.0}}
+    name = "us_sim.environment:us_sim/CompressVein-v0"
+    environment = gymnasium.make(name, scene=scene, settings=settings)
+    assert environment.spec.max_episode_steps == 7
+    assert environment.observation_space["image"].shape == (80, 96, 1)
+    assert environment.observation_space["pose"].high[:3] == pytest.approx(0.02, abs=6e-3)
+    _, first = environment.reset(seed=1, options={"height": np.float32(0), "gain": np.zeros(2)})
+    steps = [environment.step(np.float32([0, 0, 1, 0, 0, 0])) for _ in range(7)]
+    observations, _, _, truncated, infos = zip(*steps, strict=True)
+    assert all(seen in environment.observation_space for seen in observations)
+    assert all(info.keys() == first.keys() for info in infos)
+    assert truncated == (False,) * 6 + (True,)
+    assert infos[-1]["cost"] == infos[-1]["force"] - 1.0 > 0.0
+
+
+def test_a_velocity_is_translated_to_the_force_that_leads_to_it(scene):
+    def depths(control):
+        settings = {"tissue": {"solver": "fem"}, "episode": {"draws": PLAIN, "control": control}}
+        environment = ScanEnvironment(scene=scene, settings=settings)
+        environment.reset()
+        for z in [0.6] * 8 + [-0.2] * 4:
+            environment.step(environment.translate_twist(np.array([0, 0, z, 0, 0, 0])))
+            yield environment.truth.pose.position[2]
+
+    assert list(depths("force")) == pytest.approx(list(depths("twist")), abs=1e-9)
+
+
 def test_an_observation_is_late_by_the_delay(plain):
     def depths(delay):
         first, _ = plain.reset(options={"delay": delay})

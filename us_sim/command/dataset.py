@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from us_sim.command.options import add_setting_options, read_settings
+from us_sim.command.options import add_setting_options, read_settings, scene_keys
 from us_sim.errors import EpisodeError
 
 
@@ -31,6 +31,13 @@ def dataset_options(parser: argparse.ArgumentParser) -> None:
         help="have the episodes made on this Ray cluster in place of processes; local: on one that "
         "is started on this machine (extra ray)",
     )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="set a key of the scenes, as tissue.solver=fem; may be given again",
+    )
     add_setting_options(parser, DatasetSettings, ("episodes", "task", "workers", "seed", "format"))
     parser.set_defaults(command=_dataset)
 
@@ -38,4 +45,5 @@ def dataset_options(parser: argparse.ArgumentParser) -> None:
 def _dataset(args: argparse.Namespace) -> int:
     from us_sim.environment.dataset import DatasetSettings, make_dataset
 
-    return make_dataset(args.scenes, read_settings(args, DatasetSettings))
+    settings = read_settings(args, DatasetSettings)
+    return make_dataset(args.scenes, settings, scene_keys(args.set))

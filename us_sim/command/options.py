@@ -255,3 +255,28 @@ def node_parameters(texts: Sequence[str]) -> dict[str, dict[str, str]]:
             )
         parameters.setdefault(node, {})[name] = value
     return parameters
+
+
+def scene_keys(texts: Sequence[str]) -> dict[str, Any]:
+    """Read keys of a scene that ``--set`` changes, as its YAML has them.
+
+    >>> scene_keys(["tissue.solver=fem", "episode.steps=100", "episode.draws={gain: [0, 0]}"])
+    {'tissue': {'solver': 'fem'}, 'episode': {'steps': 100, 'draws': {'gain': [0, 0]}}}
+
+    Raises:
+        UsSimError: a text is not written ``key.key=value``.
+    """
+    import yaml
+
+    keys: dict[str, Any] = {}
+    for text in texts:
+        inner = keys
+        try:
+            key, value = text.split("=", 1)
+            *above, last = key.split(".")
+            for name in above:
+                inner = inner.setdefault(name, {})
+            inner[last] = yaml.safe_load(value)
+        except (AttributeError, TypeError, ValueError, yaml.YAMLError) as error:
+            raise UsSimError(f"--set {text}: write KEY=VALUE, as tissue.solver=fem") from error
+    return keys

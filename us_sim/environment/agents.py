@@ -1,4 +1,4 @@
-"""Agents: one that is written down, and a linear one that is learnt; both see images, not truths.
+"""Agents that are written down.
 
 `VisualServo` looks for the largest dark and round spot, as a person looks for a vein, brings it to
 the image's middle, presses until it is gone, and lets go.
@@ -139,31 +139,6 @@ class VisualServo:
         near = min(spots, key=lambda s: math.hypot(s.centre[0] - x, s.centre[1] - y))
         apart = math.hypot(near.centre[0] - x, near.centre[1] - y)
         return near if apart < 1.2 * math.sqrt(self._last.area) else None
-
-
-FEATURES = ("offset", "seen", "contact", "force", "one")
-"""Inputs of `LinearPolicy`: offset of the largest dark spot over a tenth of the image's width,
-whether there is one, part of the face that touches, N along the axis over 10 N, and 1."""
-
-
-class LinearPolicy:
-    """An action along x and z that is linear in `FEATURES`.
-
-    Args:
-        weights: (2 * 5,), rows for x and z.
-    """
-
-    def __init__(self, weights: NDArray[np.float64]) -> None:
-        self._weights = np.reshape(weights, (2, len(FEATURES)))
-
-    def act(self, observation: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
-        """(6,) the next action."""
-        spots = dark_spots(observation["image"])
-        columns = observation["image"].shape[1]
-        offset = 10.0 * (spots[0].centre[0] / (columns - 1) - 0.5) if spots else 0.0
-        touch, force = float(observation["contact"][0]), -float(observation["wrench"][2]) / 10.0
-        x, z = self._weights @ np.array([offset, bool(spots), touch, force, 1.0])
-        return np.array([x, 0.0, z, 0.0, 0.0, 0.0], np.float32).clip(-1.0, 1.0)
 
 
 class Wander:

@@ -37,6 +37,7 @@ from us_sim.environment.tasks import TASKS
 from us_sim.errors import EpisodeError, UsSimError
 from us_sim.progress import Progress
 from us_sim.recording.repair import versions
+from us_sim.run.processes import end_with_parent
 from us_sim.scene.scene import Scene
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import document_of
@@ -107,15 +108,22 @@ class _Order:
         return None
 
 
-def make_dataset(scenes: Sequence[str], settings: DatasetSettings) -> int:
-    """Make what is not there yet of a data set; 1 if an episode failed, 0 else.
+def make_dataset(
+    scenes: Sequence[str], settings: DatasetSettings, changes: Mapping[str, Any] | None = None
+) -> int:
+    """Make what is not there yet of a data set; return 1 if an episode failed, 0 else.
+
+    Args:
+        scenes: names or files.
+        settings: of the data set.
+        changes: keys of the scenes, in place of their own.
 
     Raises:
         UsSimError: a scene cannot be used, the folder holds another data set, a file cannot be
             written, or a process was ended.
     """
     out = _folder(settings)
-    loaded = [scene_of(scene) for scene in scenes]
+    loaded = [scene_of(scene, settings=changes) for scene in scenes]
     _require_format(loaded, out, settings)
     head = _head(scenes, loaded, settings)
     _require_same(out, head)
@@ -135,14 +143,15 @@ def make_dataset(scenes: Sequence[str], settings: DatasetSettings) -> int:
         for begun in out.glob(".*.partial-*") if isinstance(out, Path) else ():
             shutil.rmtree(begun, ignore_errors=True)  # by processes that were killed
     made = {name: facts for name, facts in found.items() if facts is not None}
-    _write(out / "manifest.json", _json({**head, "episodes": made}))
-    images = sum(int(facts.get("images", 0)) for facts in made.values())
     failed = {name: facts["error"] for name, facts in made.items() if "error" in facts}
-    _write(out / "README.md", _card(head, images, len(made) - len(failed)))
-    print(
-        f"{counted(images, 'image')} in {counted(len(made) - len(failed), 'episode')} in "
-        f"{settings.out}"
-    )
+    images = counted(sum(int(facts.get("images", 0)) for facts in made.values()), "image")
+    amount, successes = f"{images} in {counted(len(made) - len(failed), 'episode')}", {}
+    if settings.task:
+        successes["successes"] = sum(facts.get("is_success", False) for facts in made.values())
+        amount += f", {successes['successes']} of them with the task done"
+    _write(out / "manifest.json", _json({**head, **successes, "episodes": made}))
+    _write(out / "README.md", _card(head, amount))
+    print(f"{amount}, in {settings.out}")
     for name, error in failed.items():
         print(f"{name} failed: {error}")
     is_video, whole = _FORMATS[settings.format], {n: made[n] for n in made.keys() - failed}
@@ -208,9 +217,7 @@ def _made(
 @contextlib.contextmanager
 def _processes(workers: int) -> Iterator[_Submit]:
     context = multiprocessing.get_context("spawn")  # numba and threads are here already
-    # Ctrl-C is for this process, which lets the others finish their episodes.
-    ignore = signal.SIGINT, signal.SIG_IGN
-    with ProcessPoolExecutor(workers, context, signal.signal, ignore) as pool:
+    with ProcessPoolExecutor(workers, context, _begin_worker) as pool:
         try:
             yield lambda order: pool.submit(_episode, order)
         except BrokenProcessPool as error:
@@ -220,6 +227,12 @@ def _processes(workers: int) -> Iterator[_Submit]:
             ) from error
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def _begin_worker() -> None:
+    """End with the process that makes the data set, which alone hears Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent(signal.SIGKILL)
 
 
 @contextlib.contextmanager
@@ -309,12 +322,15 @@ def _record(order: _Order, path: Path) -> dict[str, Any]:
     labels = environment.simulation.volume.label_names
     with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as shard:
         while True:
-            action = agent.act(observation)
+            action = environment.translate_twist(agent.act(observation))
             members = _members(environment, observation, labels)
             observation, reward, done, truncated, info = environment.step(action)
             step = members.pop("json") | {"action": action.tolist()}
             if order.task:
-                step |= {"reward": reward, "is_success": done, **environment.task.facts()}
+                known = {
+                    name: fact for name, fact in environment.task.facts().items() if fact == fact
+                }
+                step |= {"reward": reward, "is_success": done, **known}
                 is_success = is_success or done
             members["json"] = _json(step)
             for ending, content in members.items():
@@ -413,12 +429,11 @@ def _require_same(out: Path, head: Mapping[str, Any]) -> None:
         )
 
 
-def _card(head: Mapping[str, Any], images: int, episodes: int) -> bytes:
+def _card(head: Mapping[str, Any], amount: str) -> bytes:
     return (
         _CARD.read_text(encoding="utf-8")
         .format(
-            images=images,
-            episodes=episodes,
+            amount=amount,
             scenes=", ".join(head["scenes"]),
             task=head["task"] or "none: the probe wanders over the skin",
             seed=head["seed"],

@@ -249,6 +249,19 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         for name, value in state.episode.items():
             setattr(self, name, copy.copy(value))
 
+    def translate_twist(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the action that moves the probe as one of the `twist` control would.
+
+        With the `force` control it asks for the force that leads to the same velocity; no force
+        moves the probe away from where none is felt.
+        """
+        given = self._settings
+        translated = action.copy()
+        if given.control == "force":
+            wanted = self.truth.force + action[2] * given.force_error
+            translated[2] = np.clip(2 * wanted / given.force - 1, -1, 1)
+        return translated
+
     def _info(self) -> dict[str, Any]:
         force = self.truth.force
         return {

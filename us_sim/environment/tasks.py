@@ -1,6 +1,7 @@
 """Tasks of `us_sim.environment`: reward and success, from the truth that a simulator knows.
 
-The rewards of an episode's steps sum to between -1 and 0; what is done of the task adds up to 1.
+The rewards of an episode's steps sum to between -1 and 0; what is done of the task adds up to 1,
+and is taken back where it is undone.
 """
 
 from __future__ import annotations
@@ -22,8 +23,6 @@ _HARDLY_CUT = 0.1
 """Part of its largest cross-section at rest in the episode below which a vessel is not in view."""
 _TOUCHING = 0.9
 """Part of the face that touches."""
-_CLOSED = 0.4
-"""Part of compressing a vein that is done once it was closed."""
 
 
 class Task(ABC):
@@ -120,18 +119,21 @@ class CompressVein(_VesselTask):
         self.is_closed = False  # at some time in the episode
 
     def judge(self, state: State) -> tuple[float, float]:
-        """Reward less of the vein, and once it was closed, less force.
+        """Return no reward but the part that is done, which grows the further an episode gets.
 
-        Whoever gets further always returns more: without closure at most -0.25, with it -0.1 to
-        0.4, and 0.5 to 1 once it is let go.
+        Up to 0.1 for contact and 0.2 for less of the vein, 0.5 once it was closed, up to 0.3 more
+        for less force, and all of it when the vein is let go.
         """
         self._look(state)
         if not self.is_closed:
             self.is_closed = self._hold(self.fraction <= WALLS_TOUCH, 5)
-            return -0.25 - 0.25 * min(self.fraction, 1.0), _CLOSED * self.is_closed
-        let_go = state.force < 1.0 and self.fraction >= _OPEN
-        limit = self._simulation.scene.episode.force
-        return -0.25 * min(max(state.force, 0.0) / limit, 1.0), 1.0 if let_go else _CLOSED
+        if not self.is_closed:
+            shut = np.clip((1.0 - self.fraction) / (1.0 - WALLS_TOUCH), 0.0, 1.0)
+            return 0.0, 0.1 * state.contact + 0.2 * float(shut)
+        if state.force < 1.0 and self.fraction >= _OPEN:
+            return 0.0, 1.0
+        pressed = max(state.force, 0.0) / self._simulation.scene.episode.force
+        return 0.0, 0.5 + 0.3 * (1.0 - min(pressed, 1.0))
 
     def facts(self) -> dict[str, float]:
         """Add whether the vein was closed."""
