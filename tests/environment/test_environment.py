@@ -282,8 +282,8 @@ def test_thickness_multiplies_the_depths_of_labels(scene):
 @pytest.mark.parametrize(
     ("action", "said"),
     [
-        ([0, 0, np.nan, 0, 0, 0], "the action has nan in"),
-        ([0, 0, 1], r"the action has shape \(3,\)"),
+        ([0, 0, np.nan, 0, 0, 0], "the action .* nan, .* is not six numbers"),
+        ([0, 0, 1], "the action .* is not six numbers"),
     ],
 )
 def test_an_action_that_is_none_is_refused(plain, action, said):

@@ -13,10 +13,8 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -26,7 +24,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
-from us_sim.environment.simulation import Draw, Simulation, SimulationState, State
+from us_sim.environment.simulation import Draw, Simulation, State
 from us_sim.environment.tasks import TASKS
 from us_sim.errors import EpisodeError, SceneError
 from us_sim.geometry.pose import Pose
@@ -42,8 +40,8 @@ _SENSOR = np.array([100.0, 100.0, 100.0, 10.0, 10.0, 10.0])
 """N, N m: range of the sensor that observes the wrench."""
 _FARTHEST = 0.1
 """m, that tissue is observed to move."""
-_EPISODE = ("draw", "task", "_truth", "_step", "_done", "_late")
-"""Attributes of an environment that belong to the episode, besides its random numbers."""
+_EPISODE = ("draw", "task", "_step", "_done", "_late")
+"""Attributes of an environment that belong to the episode."""
 
 Observation = dict[str, NDArray[Any]]
 
@@ -74,15 +72,6 @@ def scene_of(
     if settings:
         document = merged(document, _plain(settings))
     return parse_scene(document, origin=origin, folders=folders)
-
-
-@dataclass(frozen=True, eq=False)
-class EnvironmentState:
-    """All that decides what comes in an environment, but for its scene and its actions."""
-
-    episode: Mapping[str, Any]  # attributes of the environment
-    random: np.random.Generator
-    simulation: SimulationState
 
 
 class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -135,16 +124,16 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         margin = 6 * np.array(episode.draws.position_noise[1])
         low = np.array([-episode.aside, -episode.aside, -episode.lift]) - margin
         high = np.array([episode.aside, episode.aside, episode.press]) + margin
-        entries: dict[str, spaces.Box] = {
+        entries = {
             "image": spaces.Box(0, 255, (rows, columns, 1), np.uint8),
             "labels": spaces.Box(0, 255, (rows, columns, 1), np.uint8),
             "displacement": spaces.Box(-_FARTHEST, _FARTHEST, (rows, columns, 2), np.float32),
             "strain": spaces.Box(-1.0, 1.0, (rows, columns, 1), np.float32),
-            "wrench": _box(-_SENSOR, _SENSOR),
-            "pose": _box([*low, -1, -1, -1, -1], [*high, 1, 1, 1, 1]),
+            "wrench": spaces.Box(-_SENSOR, _SENSOR, dtype=np.float32),
             "contact": spaces.Box(0.0, 1.0, (1,), np.float32),
-            "goal": _box([*low, -1, -1, -1, -1], [*high, 1, 1, 1, 1]),
         }
+        low, high = np.append(low, [-1.0] * 4), np.append(high, [1.0] * 4)
+        entries["pose"] = entries["goal"] = spaces.Box(low, high, dtype=np.float32)
         names = (*episode.observe, *(("goal",) if self.task.has_goal else ()))
         self._spaces = {name: entries[name] for name in names}
         self.observation_space: Any = spaces.Dict(self._spaces)
@@ -232,22 +221,22 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
             raise EpisodeError("no episode has begun: call reset first")
         return self._truth
 
-    def state(self) -> EnvironmentState:
+    def state(self) -> dict[str, Any]:
         """Copy all that decides what comes, so that `restore` can go on from here.
 
         Raises:
             EpisodeError: no episode has begun.
         """
-        _ = self.truth
-        episode = {name: copy.copy(getattr(self, name)) for name in _EPISODE}
-        return EnvironmentState(episode, copy.deepcopy(self.np_random), self.simulation.state())
+        kept = {"simulation": self.simulation.state(), "_truth": self.truth}
+        kept["_np_random"] = copy.deepcopy(self.np_random)
+        return kept | {name: copy.copy(getattr(self, name)) for name in _EPISODE}
 
-    def restore(self, state: EnvironmentState) -> None:
+    def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from a state of this environment, as often as is wanted."""
-        self.simulation.restore(state.simulation)
-        self.np_random = copy.deepcopy(state.random)
-        for name, value in state.episode.items():
-            setattr(self, name, copy.copy(value))
+        self.simulation.restore(state["simulation"])
+        self._truth, self.np_random = state["_truth"], copy.deepcopy(state["_np_random"])
+        for name in _EPISODE:
+            setattr(self, name, copy.copy(state[name]))
 
     def translate_twist(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the action that moves the probe as one of the `twist` control would.
@@ -320,18 +309,9 @@ def _checked(action: ArrayLike) -> NDArray[np.float64]:
         numbers = np.asarray(action, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise EpisodeError(f"the action {action!r} is no array of numbers") from error
-    if numbers.shape != (6,):
-        raise EpisodeError(f"the action has shape {numbers.shape}: give six numbers from -1 to 1")
-    for number in numbers.tolist():
-        if math.isnan(number) or not abs(number) <= 1.0 + 1e-6:
-            raise EpisodeError(
-                f"the action has {number:g} in {numbers.tolist()}: give six numbers from -1 to 1"
-            )
+    if numbers.shape != (6,) or not (np.abs(numbers) <= 1.0 + 1e-6).all():
+        raise EpisodeError(f"the action {numbers.tolist()} is not six numbers from -1 to 1")
     return np.clip(numbers, -1.0, 1.0)
-
-
-def _box(low: ArrayLike, high: ArrayLike) -> spaces.Box:
-    return spaces.Box(np.asarray(low, np.float32), np.asarray(high, np.float32))
 
 
 def _seven(pose: Pose) -> NDArray[np.float64]:

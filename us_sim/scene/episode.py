@@ -97,9 +97,7 @@ class EpisodeSettings(Settings):
         default="twist",
     )
     force: float = setting(
-        Quantity("force", 0.1, 200.0),
-        "wanted at an action of 1, none at -1; more than it counts as a cost",
-        default=20.0,
+        Quantity("force", 0.1, 200.0), "wanted at an action of 1, none at -1", default=20.0
     )
     force_error: float = setting(
         Quantity("force", 0.01, 200.0),
