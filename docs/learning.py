@@ -85,7 +85,9 @@ def main() -> None:
     """Train, compare, draw."""
     environment = ScanEnvironment("CompressVein", settings=SETTINGS)
     arm = Monitor(Senses(environment, ONE_ARM), info_keywords=("is_success",))
-    model = PPO("MlpPolicy", arm, n_steps=1000, batch_size=100, seed=1)
+    # Noise that lasts for some steps presses deeper than noise which is new in each.
+    smooth = {"use_sde": True, "sde_sample_freq": 8, "policy_kwargs": {"log_std_init": -1.0}}
+    model = PPO("MlpPolicy", arm, n_steps=1000, batch_size=100, seed=1, **smooth)
     with Progress("training", TRAINING, "steps") as bar:
 
         def show(now: dict[str, Any], _: Any) -> bool:

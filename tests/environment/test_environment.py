@@ -139,7 +139,13 @@ def test_a_wanted_force_is_reached(scene):
 
 
 @pytest.mark.parametrize(
-    ("solver", "skin"), [("fem", {}), ("fem_nonlinear", None), ("fem_cg", None), ("msds", None)]
+    ("solver", "skin"),
+    [
+        ("fem", {}),
+        pytest.param("fem_nonlinear", None, marks=pytest.mark.slow),
+        pytest.param("fem_cg", None, marks=pytest.mark.slow),
+        pytest.param("msds", None, marks=pytest.mark.slow),
+    ],
 )
 def test_a_restored_state_goes_on_with_the_same_bytes(scene, solver, skin):
     draws = PLAIN | {"delay": [2, 2], "position_noise": [1e-3, 1e-3], "stiffness": [0.5, 2]}

@@ -46,7 +46,7 @@ def test_observations_are_what_the_environment_gave_and_truths_are_of_the_moment
     environment = ScanEnvironment("FindVein", scene)
     observed, _ = environment.reset(seed=facts["seed"])
     for number, frame in enumerate(frames, 1):
-        assert np.array_equal(frame["observation.images.ultrasound"], observed["image"])
+        assert np.array_equal(frame["observation.images.ultrasound"], observed["image"][..., 0])
         state = dict(zip(names["observation.state"], frame["observation.state"], strict=True))
         assert state["contact.contact"] == observed["contact"][0]
         assert [state[f"pose.{part}"] for part in "xyz"] == observed["pose"][:3].tolist()

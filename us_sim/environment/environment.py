@@ -36,7 +36,7 @@ from us_sim.tracking.robot import approach_speed, kept_within
 
 DEFAULT_SCENE = "upper_arm_learning"
 
-_SENSOR = np.array([100.0, 100.0, 100.0, 10.0, 10.0, 10.0])
+_SENSOR = np.float32([100.0, 100.0, 100.0, 10.0, 10.0, 10.0])
 """N, N m: range of the sensor that observes the wrench."""
 _FARTHEST = 0.1
 """m, that tissue is observed to move."""
@@ -132,8 +132,8 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
             "wrench": spaces.Box(-_SENSOR, _SENSOR, dtype=np.float32),
             "contact": spaces.Box(0.0, 1.0, (1,), np.float32),
         }
-        low, high = np.append(low, [-1.0] * 4), np.append(high, [1.0] * 4)
-        entries["pose"] = entries["goal"] = spaces.Box(low, high, dtype=np.float32)
+        low, high = np.float32([*low, -1, -1, -1, -1]), np.float32([*high, 1, 1, 1, 1])
+        entries["pose"] = entries["goal"] = spaces.Box(low, high)
         names = (*episode.observe, *(("goal",) if self.task.has_goal else ()))
         self._spaces = {name: entries[name] for name in names}
         self.observation_space: Any = spaces.Dict(self._spaces)
