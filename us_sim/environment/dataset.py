@@ -150,7 +150,14 @@ def make_dataset(
         successes["successes"] = sum(facts.get("is_success", False) for facts in made.values())
         amount += f", {successes['successes']} of them with the task done"
     _write(out / "manifest.json", _json({**head, **successes, "episodes": made}))
-    _write(out / "README.md", _card(head, amount))
+    card = _CARD.read_text(encoding="utf-8").format(
+        amount=amount,
+        scenes=", ".join(scenes),
+        task=settings.task or "none: the probe wanders over the skin",
+        seed=settings.seed,
+        version=__version__,
+    )
+    _write(out / "README.md", card.encode())
     print(f"{amount}, in {settings.out}")
     for name, error in failed.items():
         print(f"{name} failed: {error}")
@@ -427,20 +434,6 @@ def _require_same(out: Path, head: Mapping[str, Any]) -> None:
         raise EpisodeError(
             f"--out {out}: holds a data set of other {', '.join(other)}; choose another folder"
         )
-
-
-def _card(head: Mapping[str, Any], amount: str) -> bytes:
-    return (
-        _CARD.read_text(encoding="utf-8")
-        .format(
-            amount=amount,
-            scenes=", ".join(head["scenes"]),
-            task=head["task"] or "none: the probe wanders over the skin",
-            seed=head["seed"],
-            version=head["versions"]["us_sim"],
-        )
-        .encode()
-    )
 
 
 def _json(content: Mapping[str, Any]) -> bytes:

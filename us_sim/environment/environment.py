@@ -36,7 +36,7 @@ from us_sim.tracking.robot import approach_speed, kept_within
 
 DEFAULT_SCENE = "upper_arm_learning"
 
-_SENSOR = np.float32([100.0, 100.0, 100.0, 10.0, 10.0, 10.0])
+_SENSOR = np.array([100.0, 100.0, 100.0, 10.0, 10.0, 10.0], np.float32)
 """N, N m: range of the sensor that observes the wrench."""
 _FARTHEST = 0.1
 """m, that tissue is observed to move."""
@@ -93,6 +93,7 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         "render_fps": 30,
         "autoreset_mode": AutoresetMode.DISABLED,
     }
+    _spec: EnvSpec | None = None
 
     def __init__(
         self,
@@ -124,7 +125,7 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         margin = 6 * np.array(episode.draws.position_noise[1])
         low = np.array([-episode.aside, -episode.aside, -episode.lift]) - margin
         high = np.array([episode.aside, episode.aside, episode.press]) + margin
-        entries = {
+        entries: dict[str, Any] = {
             "image": spaces.Box(0, 255, (rows, columns, 1), np.uint8),
             "labels": spaces.Box(0, 255, (rows, columns, 1), np.uint8),
             "displacement": spaces.Box(-_FARTHEST, _FARTHEST, (rows, columns, 2), np.float32),
@@ -132,8 +133,9 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
             "wrench": spaces.Box(-_SENSOR, _SENSOR, dtype=np.float32),
             "contact": spaces.Box(0.0, 1.0, (1,), np.float32),
         }
-        low, high = np.float32([*low, -1, -1, -1, -1]), np.float32([*high, 1, 1, 1, 1])
-        entries["pose"] = entries["goal"] = spaces.Box(low, high)
+        lowest, highest = np.append(low, [-1.0] * 4), np.append(high, [1.0] * 4)
+        placed = spaces.Box(lowest.astype(np.float32), highest.astype(np.float32))
+        entries["pose"] = entries["goal"] = placed
         names = (*episode.observe, *(("goal",) if self.task.has_goal else ()))
         self._spaces = {name: entries[name] for name in names}
         self.observation_space: Any = spaces.Dict(self._spaces)
