@@ -3,7 +3,7 @@
 pip install '.[baselines]' && python docs/learning.py
 
 It draws docs/learning.png, and prints the table of docs/learning.md. Training draws where the probe
-starts on one arm, and the comparison everything. It takes some ten minutes on one core.
+starts on one arm, and the comparison everything. It takes some five minutes on one core.
 """
 
 from __future__ import annotations
