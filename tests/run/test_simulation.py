@@ -22,7 +22,7 @@ class Supervisor:
 
     def __init__(self, plan, control):
         self.plan, self.why, self.waiting = plan, "", []
-        self.control = lambda _, settings: control.show(settings) or control
+        self.control = lambda _check, _take, settings: control.show(settings) or control
         self.monitor = SimpleNamespace(reports={})
         self.plans = [plan]
 
