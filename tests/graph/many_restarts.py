@@ -85,7 +85,11 @@ class Listener:
         return sum(t >= since for t in self.times) / (time.monotonic() - since)
 
     def wait_for_full_rate(self):
-        """Until images come at their usual rate for two seconds, or that has become slower."""
+        """Until images come at their usual rate for two seconds, or that has become slower.
+
+        Meanwhile the supervisor hears of who has just come: nodes report once a second.
+        """
+        self.spin(1.5)
         until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until:
             self.spin(0.5)

@@ -12,6 +12,7 @@ from us_sim.nodes import INTERRUPTED
 from us_sim.recording.writer import BagWriter
 from us_sim.run.plan import NodeProcess, Plan, Request, plan_of
 from us_sim.run.supervision import (
+    RESTART_S,
     START_S,
     Outcome,
     SupervisionSettings,
@@ -326,8 +327,9 @@ def test_a_silent_one_hangs_and_is_started_again(clock, session):
     assert when == pytest.approx(30.0, abs=0.25)
     assert lost == ["has not reported for 30 s"]
     assert silent.is_noted
-    # The process that takes its place may compile for long.
-    assert pass_time(supervisor, clock, START_S - 1.0, step=0.5)[1] == []
+    # The process that takes its place may prepare for long, but not as long as a first one.
+    assert pass_time(supervisor, clock, RESTART_S - 1.0, step=0.5)[1] == []
+    assert pass_time(supervisor, clock, 2.0, step=0.5)[1] == ["has not reported for 120 s"]
 
 
 def test_one_that_never_reports_ends_all(clock, session):

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 IMAGES, IMAGER = "ultrasound/image", "slice_interpolator"
 RECORDER_STOP_S = 10.0  # a recorder may take to end: it writes what it still holds
 START_S = 900.0  # for the first report: a first run compiles for minutes
+RESTART_S = 120.0  # likewise of a node that was ready before, whose kernels are kept
 STEP_S = 0.5
 """A longer time between two looks counts as this much: this process was stopped or had no time."""
 TOLD = 4  # losses that are told one by one in a sentence
@@ -294,12 +295,17 @@ class Supervisor:
             silent = self._watched - running.heard_at
             if count != running.reports:
                 running.reports, running.heard_at = count, self._watched
-            elif silent > (self._settings.silence if count else START_S):
+            elif silent > self._patience(node, count):
                 if node not in self._were_ready:
                     raise UsSimError(f"{node} did not start in {START_S / 60:g} minutes")
                 said = self.monitor.messages.get(node) or running.last_words
                 self._end([node])
                 self._on_lost(node, f"has not reported for {silent:.0f} s", said)
+
+    def _patience(self, node: str, reports: int) -> float:
+        """Return how long (s) a node may be silent that has reported so often."""
+        first = max(RESTART_S, self._settings.silence) if node in self._were_ready else START_S
+        return self._settings.silence if reports else first
 
     def _on_lost(self, node: str, what: str, said: str) -> None:
         """Note a node's end, and start it again with the values that it was first started with."""

@@ -62,11 +62,13 @@ def score_packet(message: DiagnosticArray, sequence: int) -> Packet:
         of_kind.setdefault(shown(status.hardware_id), []).append(status)
     plain, about = (of_kind.get(kind, [DiagnosticStatus()])[0] for kind in ("plain", "about"))
     faults = [{"what": shown(each.message), **_values(each)} for each in of_kind.get("fault", [])]
+    state = plain.message if plain.message in STATES else "to lift"
     header = {
         "name": shown(first.name),
         "description": shown(first.message),
         "scene": shown(first.hardware_id),
-        "state": plain.message if plain.message in STATES else "to lift",
+        "state": state,
+        "words": STATES[state],
         "about": {"begun": "", "feedback": "live", **_values(about)},
         "plain": _values(plain),
         "steps": [_step(status) for status in of_kind.get("step", [])],

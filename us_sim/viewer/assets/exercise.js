@@ -35,7 +35,8 @@ function show() {
   line.hidden = !steps.length;
   line.classList.toggle("us-next", Boolean(next));
   const done = steps.filter(({ state }) => state === "done").length;
-  const words = next ? `${next.what}: ${next.seen}` : `${done} of ${steps.length} done`;
+  const todo = next ? `${next.what}: ${next.seen}` : `${done} of ${steps.length} done`;
+  const words = told.state === "to lift" ? told.words : todo;
   if (line.textContent !== words) line.textContent = line.title = words;
 }
 
