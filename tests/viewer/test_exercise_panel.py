@@ -102,6 +102,18 @@ def test_a_blind_exercise_hides_the_truth_and_asks(page, simulator):
     page.get_by_role("button", name="Outlines").wait_for()
 
 
+def test_who_only_watches_answers_and_erases_nothing(page, simulator):
+    scorer = Scorer(simulator)
+    page.goto(f"{page.address}?watch")
+    page.locator("#us-panels").click()
+    page.get_by_role("tab", name="Exercise").click()
+    until(lambda: scorer.picture.is_watched, "the panel is seen")
+    scorer.say(STEPS, feedback="afterwards")
+    page.get_by_text("To do: vein at <b>29 mm, not reached").wait_for()
+    assert not page.get_by_role("button", name="not compressible").count()
+    page.get_by_role("button", name="Begin anew").wait_for(state="hidden")
+
+
 @pytest.fixture
 def heard(bench: Bench):
     """The simulator that a node fills."""

@@ -235,7 +235,8 @@ def graph(bench: Bench) -> SimpleNamespace:
     for made in (SkinFeeds(node, post, 30.0), probe):
         feeds |= {feed.kind: feed for feed in made.feeds}
     feeds |= {feed.kind: feed for feed in TissueFeeds(node, post, 30.0, rest).feeds}
-    feeds["structures"] = StructuresFeed(node, post, rest).feed
+    structures = StructuresFeed(node, post, rest)
+    feeds["structures"] = structures.feed
 
     def newest(kind: str, when: Callable[[Packet], bool] = lambda _: True) -> Packet:
         found: list[Packet] = []
@@ -255,6 +256,7 @@ def graph(bench: Bench) -> SimpleNamespace:
 
     kept: list[object] = []
     told = {"feeds": feeds, "newest": newest, "latch": latch, "probe": probe}
+    told["structures"] = structures
     return SimpleNamespace(bench=bench, node=node, **told)
 
 
@@ -354,6 +356,9 @@ def test_structures_are_heard_once_and_carried_from_then_on(graph):
     assert packet.header["parts"][0]["name"] == "vein"
     graph.bench.spin_until(lambda: graph.bench.peer.count_subscribers("tissue/structures") == 0)
     assert graph.bench.peer.count_subscribers("tissue/nodes") == 0
+    graph.structures.forget()  # another scene has the same mesh
+    assert graph.feeds["structures"].newest() is None
+    graph.bench.spin_until(lambda: graph.bench.peer.count_subscribers("tissue/structures") == 1)
 
 
 def test_the_probe_comes_with_its_shape_its_pose_and_its_force(graph):

@@ -435,6 +435,12 @@ class StructuresFeed:
         self._made_for: int | None = None  # the number of the mesh
         self._making: threading.Thread | None = None
 
+    def forget(self) -> None:
+        """Drop those of a scene that another has taken the place of, if on the same mesh."""
+        self._made_for = None
+        self.feed.forget()
+        self._listen()
+
     def _listen(self) -> None:
         """Hear of meshes while watched, and of the rest until it has been used."""
         self._rest.watch(self._listen, self.feed.is_watched)

@@ -184,6 +184,8 @@ class ViewerSession(SessionBoard):
         self._timer.cancel()
         self._client: AsyncParameterClient | None = None
         self._heard = 0.0
+        self.on_other_scene: Callable[[], None] = lambda: None
+        """Called in the node's thread when another scene takes the place of one."""
 
     def _listen(self) -> None:
         if self.is_watched and self._client is None:
@@ -195,7 +197,9 @@ class ViewerSession(SessionBoard):
         for status in message.status:
             if status.name == self._name:
                 self._heard = time.monotonic()
-                self.state = SessionState.of(status)
+                before, self.state = self.state, SessionState.of(status)
+                if before.is_there and before.origin != self.state.origin:
+                    self.on_other_scene()
 
     def _take_scenes(self, message: DiagnosticArray) -> None:
         self.scenes = tuple(map(_scene_of, message.status))

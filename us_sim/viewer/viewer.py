@@ -59,12 +59,14 @@ class Viewer(GuardedNode):
         rest = RestMesh(self)
         self._hand = ViewerHand(self, post, self.simulator, rest)
         self._probe = ProbeFeeds(self, post, settings.rate)
+        structures = StructuresFeed(self, post, rest)
+        self._session.on_other_scene = structures.forget
         self.simulator.add(
             *image_feeds(self, post, settings.rate, self._known, self._arranged),
             *SkinFeeds(self, post, settings.rate).feeds,
             *self._probe.feeds,
             *TissueFeeds(self, post, settings.rate, rest).feeds,
-            StructuresFeed(self, post, rest).feed,
+            structures.feed,
         )
         self._server = WebServer(
             self.simulator, settings.host, settings.port, os.environ.get(TOKEN, "")

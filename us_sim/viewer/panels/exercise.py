@@ -44,6 +44,7 @@ class ExercisePanel:
     def __init__(self, simulator: Simulator) -> None:
         self._simulator, self._board = simulator, simulator.session
         self._scorer = simulator.nodes.of(_SCORER)
+        self._only_watches = "watch" in ui.context.client.request.query_params
         self._watched: list[Feed] = []
         self._told: Mapping[str, Any] | None = None  # what is shown
         self._listed: tuple[object, ...] = ()  # exercises that are shown
@@ -125,7 +126,8 @@ class ExercisePanel:
                 ).props("flat dense no-caps align=left")
                 button.props["title"] = f"{each.description} In {each.region.replace('_', ' ')}"
                 button.props["aria-current"] = str(is_loaded).lower()
-                button.set_enabled(state.is_there and not state.is_busy)
+                may_load = state.is_there and not state.is_busy and not self._only_watches
+                button.set_enabled(may_load)
 
     async def _load(self, exercise: ListedScene) -> None:
         if await load_asked(self._simulator, exercise):
@@ -149,10 +151,11 @@ class ExercisePanel:
         seconds = next(iter(told.get("plain", {}).values()), "-")
         clock = f", {seconds} s" if seconds != "-" else ""
         state = STATES[told.get("state", "to lift")]
-        asks = is_blind(told) and told["state"] == "running"
+        is_asked = is_blind(told) and told["state"] == "running"
+        asks = is_asked and not self._only_watches
         count = "" if is_blind(told) else f": {sum(done)} of {len(done)} done"
         self._result.set_text(f"{state}{count}{clock}" if done else "")
-        self._buttons.set_visibility(bool(name))
+        self._buttons.set_visibility(bool(name) and not self._only_watches)
         parts = {"steps": (steps, asks), "faults": told.get("faults", [])}
         parts |= {kind: told.get(kind, {}) for kind in ("plain", "metrics")}
         draws = {

@@ -31,6 +31,24 @@ let isFine = false;
 const hidden = new Set();
 let opacity = 1;
 
+/** Take them out of the scene. */
+function clear() {
+  for (const part of parts) part.mesh.geometry.dispose();
+  group.clear();
+  parts = [];
+}
+
+/** The name of the scene that they are of; nothing where it is not known. */
+let scene = "";
+events.on("scene", (name) => {
+  if (scene && name !== scene) {
+    clear(); // another tissue may have the same mesh
+    events.tell("structures", structures.parts);
+    stage.move();
+  }
+  scene = name;
+});
+
 stream.on("structures", (header, payload) => {
   const reader = new PacketReader(payload);
   const count = header.vertices;
@@ -39,8 +57,7 @@ stream.on("structures", (header, payload) => {
   ({ mesh, moving } = header);
   position = new THREE.BufferAttribute(new Float32Array(3 * count), 3);
   normal = new THREE.BufferAttribute(new Float32Array(3 * count), 3);
-  for (const part of parts) part.mesh.geometry.dispose();
-  group.clear();
+  clear();
   parts = header.parts.map(({ name, colour, fine, coarse }) => {
     const part = {
       name,
