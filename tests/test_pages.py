@@ -96,10 +96,10 @@ def test_the_readmes_script_runs_an_episode():
     (script,) = (c for c in re.findall(r"```python\n(.*?)```", README, re.S) if "rclpy" not in c)
     names: dict = {}
     exec(script, names)
-    assert names["image"].shape == (256, 256)
+    assert names["image"].shape == (256, 256, 1)
     assert names["image"].std() > 20
-    assert -8 < names["wrench"][2] < -4  # N, of the tissue against a press held at 6 N
-    assert 0 < names["vein"] < 0.9
+    assert names["success"]
+    assert -1 < names["wrench"][2] <= 0  # N, of the tissue: the vein is let go
 
 
 def pressed(poses):

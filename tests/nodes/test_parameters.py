@@ -5,7 +5,6 @@ import json
 import math
 import threading
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -63,8 +62,7 @@ def made(bench, node: str, scene: Any, folder: Any) -> Any:
     name = next(n for n in vars(module) if n.lower() == node.replace("_", ""))
     node_class = getattr(module, name)
     if node == "session_control":
-        simulation = SimpleNamespace(check=lambda *_: None, take=lambda *_: None)
-        node_class = partial(node_class, simulation, SessionControlSettings())
+        node_class = partial(node_class, print, print, SessionControlSettings())
     return bench.make(node_class, **given_to(node, scene, folder))
 
 

@@ -12,12 +12,13 @@ import contextlib
 import io
 import json
 import logging
-import multiprocessing
+import multiprocessing.connection
 import os
 import shutil
 import signal
 import socket
 import tarfile
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -37,7 +38,6 @@ from us_sim.environment.tasks import TASKS
 from us_sim.errors import EpisodeError, UsSimError
 from us_sim.progress import Progress
 from us_sim.recording.repair import versions
-from us_sim.run.processes import end_with_parent
 from us_sim.scene.scene import Scene
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import document_of
@@ -239,7 +239,14 @@ def _processes(workers: int) -> Iterator[_Submit]:
 def _begin_worker() -> None:
     """End with the process that makes the data set, which alone hears Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent(signal.SIGKILL)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    multiprocessing.connection.wait([parent.sentinel])
+    os._exit(1)
 
 
 @contextlib.contextmanager
