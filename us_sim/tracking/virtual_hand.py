@@ -281,6 +281,7 @@ def _stance(
     return Stance(point, float(press[0]), half_turn(rotation), fan, rock)
 
 
+_AXES = np.eye(3)
 DEEPEST = 0.02  # m that a probe is pressed at most: a vein closes at half of it, and deeper hurts
 HIGHEST = 0.05  # m that it is lifted off at most
 STEEPEST = math.radians(60)
@@ -338,15 +339,15 @@ class Stance:
     def pose(self, surface: RestSurface) -> Pose:
         """Return the pose of the probe in ``patient``."""
         foot = surface.closest(self.point)
-        orientation = product(_upright(foot.normal), rotation_exp(_about(2, self.rotation)))
-        orientation = product(orientation, rotation_exp(_about(0, self.fan)))
-        orientation = product(orientation, rotation_exp(_about(1, self.rock)))
+        orientation = _upright(foot.normal)
+        for axis, angle in ((2, self.rotation), (0, self.fan), (1, self.rock)):
+            orientation = product(orientation, rotation_exp(angle * _AXES[axis]))
         return Pose(foot.point - self.press * foot.normal, orientation)
 
     def slid(self, surface: RestSurface, along_x: float, along_y: float) -> Stance:
         """Slide along the probe's own x and y, m, as it is rotated, to the closest of the skin."""
         foot = surface.closest(self.point)
-        turned = product(_upright(foot.normal), rotation_exp(_about(2, self.rotation)))
+        turned = product(_upright(foot.normal), rotation_exp(self.rotation * _AXES[2]))
         way = Pose(np.zeros(3), turned).rotation @ np.array([along_x, along_y, 0.0])
         return replace(self, point=surface.closest(foot.point + way).point)
 
@@ -377,10 +378,3 @@ def _upright(normal: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.array([0.0, 1.0, 0.0, 0.0])
     quaternion = np.array([-y, x, 0.0, 1.0 + z])
     return np.asarray(quaternion / np.linalg.norm(quaternion))
-
-
-def _about(axis: int, angle: float) -> NDArray[np.float64]:
-    """(3,) rad, the rotation vector of a turn about one axis."""
-    vector = np.zeros(3)
-    vector[axis] = angle
-    return vector
