@@ -64,7 +64,8 @@ def test_nodes_that_end_are_back_and_the_rest_goes_on(played_scene, tmp_path):
     ]
     demo = started("demo", played_scene, *options, cwd=tmp_path)
     try:
-        wait_until(lambda: images_in(out / "session.mcap") > 20, demo)
+        # By then each node has reported, once a second, to who watches it.
+        wait_until(lambda: images_in(out / "session.mcap") > 150, demo)
         before = nodes_of(demo.pid)
         for node, (number, _) in ENDED.items():
             os.kill(before[node], number)
