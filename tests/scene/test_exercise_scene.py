@@ -44,6 +44,12 @@ def test_what_cannot_be_loaded_is_refused(tmp_path, text, said):
         load_scene("exercise:nothing_of_this_name")
 
 
+@pytest.mark.parametrize("name", ["examination#x", "examination#-1", "compression#3"])
+def test_a_seed_that_is_none_is_refused(name):
+    with pytest.raises(SceneError, match="seed"):
+        load_scene(f"exercise:{name}")
+
+
 def test_the_lesson_is_listed_first_and_in_its_order():
     lesson = [each.lesson for each in installed_exercises() if each.lesson]
     assert lesson == [1, 2, 3, 4, 5]

@@ -122,7 +122,7 @@ def test_why_an_image_shows_little_is_said_on_it(page: Any, simulator: Simulator
     words = "3 tetrahedra are inside out: msds is not made for this (set solver)"
     tissue = NodeStatus("tissue_deformer", Level.WARNING, words, {"problem": "inside out"})
     simulator.status.tell(tissue, time.monotonic())
-    is_said("msds is not made for this")
+    is_said("Tissue is inside out")
     tissue = NodeStatus("tissue_deformer", Level.WELL, "fem", {"unbalanced": "1"})
     simulator.status.tell(tissue, time.monotonic())
     is_said()

@@ -337,9 +337,10 @@ def _exercise_document(name: str) -> tuple[Any, list[Path], str]:
     document, folders = read_document(find_scene(exercise.scene), find_scene)
     more: dict[Any, Any] = {"name": Path(exercise.origin).stem, "exercise": exercise.origin}
     more["description"] = exercise.description or exercise.name
+    if given and (exercise.seeds is None or not given.isdecimal()):
+        raise SceneError(f"{origin}#{given}: a seed is a number, of an exercise that has `seeds`")
     if exercise.seeds is not None:
-        low, high = exercise.seeds
-        seed = int(given) if given.isdecimal() else random.randint(low, high)
+        seed = int(given) if given else random.randint(*exercise.seeds)
         more["volume"] = {"seed": seed}
         origin += f"#{seed}"
     return merged(document, more), folders, origin

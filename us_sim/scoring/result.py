@@ -71,10 +71,7 @@ def result_page(result: Mapping[str, Any], picture: bytes = b"") -> str:
     title = escape(result["name"])
     steps = [(MARKS[s["state"]], s["what"], s["seen"]) for s in result["steps"]]
     faults = [(f"{each['seconds']} s", each["what"]) for each in result["faults"]]
-    more = [
-        (label, text, DEFINITIONS.get(_name(label), ""))
-        for label, text in result["metrics"].items()
-    ]
+    more = [(label, text, _definition_of(label)) for label, text in result["metrics"].items()]
     shown = f'<img src="{picture_address(picture)}" alt="{_ALT}">' if picture else ""
     return (
         f'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
@@ -176,9 +173,9 @@ def _fsspec() -> Any:
     return fsspec
 
 
-def _name(label: str) -> str:
-    """Return a metric's name from its label, without the structure and the unit."""
-    return label.rpartition(", ")[0].partition(" of ")[0]
+def _definition_of(label: str) -> str:
+    """Return the definition of the metric whose name a label begins with; "" where it has none."""
+    return next((text for name, text in DEFINITIONS.items() if label.startswith(name)), "")
 
 
 def _table(rows: Iterable[Sequence[str]], kind: str = "") -> str:

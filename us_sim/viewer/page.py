@@ -146,7 +146,7 @@ class ModeBar:
         if force > 20.0:  # N; sonographers press with some 5 to 10
             remarks.append(f"Too much force: {force:.0f} N")
         if tissue and tissue.values.get("problem") == "inside out":
-            remarks.append(tissue.message.partition(" (")[0])
+            remarks.append("Tissue is inside out: press less, or choose another method")
         if self._mode == "velocity":
             remarks.append(_absent("No colour", values.get("no_colour", ""), values))
         if self._strips["spectrum"]:
