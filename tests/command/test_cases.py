@@ -48,7 +48,7 @@ def test_a_broken_case_is_said_beside_the_good_ones(cases, capsys):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["cases", "/nowhere"], "/nowhere: cannot be read"),
+        (["cases", "/proc/nowhere"], "/proc/nowhere: cannot be read"),
         (["run", "--dry-run"], "name a scene, or a case with --case"),
         (["run", "upper_arm", "--case", "arm", "--dry-run"], "the scene upper_arm is given too"),
         (["demo", "--case", "amr"], "did you mean 'arm'?"),

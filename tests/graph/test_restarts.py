@@ -161,9 +161,9 @@ def test_a_node_that_does_not_end_is_killed_and_that_is_told(deaf):
     assert not Path(f"/proc/{deaf.pid}").exists()
 
 
-def test_one_that_was_stopped_ends_by_itself_when_it_is_told_to():
+def test_one_that_was_stopped_ends_by_itself_when_it_is_told_to(tmp_path):
     node = RunningNode(
-        NodeProcess("session_recorder", {"file": "/nowhere/a.mcap"}), lambda *_: None
+        NodeProcess("session_recorder", {"file": str(tmp_path / "a.mcap")}), lambda *_: None
     )
     node.send_signal(signal.SIGSTOP)
     assert end_nodes([node], 10.0) == []
