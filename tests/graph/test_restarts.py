@@ -127,7 +127,7 @@ def test_where_nodes_are_forked_ends_they_end_and_are_back(played_scene, tmp_pat
         before, server = nodes_of(run.pid), children_of(run.pid)[FORKS]
         os.kill(server, signal.SIGKILL)
         wait_until(lambda: len({*nodes_of(run.pid).values()} - {*before.values()}) == 4, run)
-        assert not any(Path(f"/proc/{pid}").exists() for pid in before.values())
+        wait_until(lambda: not any(Path(f"/proc/{p}").exists() for p in before.values()), run)
         run.send_signal(signal.SIGINT)
         said = run.communicate(timeout=60)[1]
     finally:
@@ -146,7 +146,8 @@ def main(_):
 @pytest.fixture
 def deaf(monkeypatch):
     """A node that does not end when it is told to."""
-    monkeypatch.setattr(NodeProcess, "module", __name__)
+    monkeypatch.syspath_prepend(Path(__file__).parent)
+    monkeypatch.setattr(NodeProcess, "module", Path(__file__).stem)
     node = RunningNode(NodeProcess("session_recorder"), lambda *_: None)
     deadline = time.monotonic() + 30
     while node.last_words != "deaf":
