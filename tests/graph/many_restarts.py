@@ -174,7 +174,7 @@ def start(folder, scene, path):
     """`us-sim run` with a path that begins again at its end, recorded; it may restart for ever."""
     command = [sys.executable, "-m", "us_sim", "run", str(scene), "--path", str(path)]
     command += ["--record", str(folder / "session.mcap"), "--param", "path_player.loop=true"]
-    command += ["--restarts", "1000000", "--silence", "3"]
+    command += ["--restarts", "1000000", "--silence", "2"]
     with (folder / "said.txt").open("w") as said:
         return subprocess.Popen(command, stderr=said, stdout=said)
 

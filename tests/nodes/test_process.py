@@ -5,10 +5,11 @@ import signal
 import subprocess
 import sys
 import textwrap
+from xml.etree import ElementTree
 
 import pytest
 
-from us_sim.nodes import process
+from us_sim.nodes import announce_often, process
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.process import go_first
 from us_sim.share import find_bag
@@ -115,3 +116,14 @@ def test_what_a_node_does_not_use_it_does_not_import(modules, unused):
     program = f"import sys, {modules}\nprint(*({unused!r} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert (done.returncode, done.stdout.split()) == (0, []), done.stderr
+
+
+def test_nodes_are_announced_often_unless_a_profile_is_set(monkeypatch):
+    variable = "FASTRTPS_DEFAULT_PROFILES_FILE"
+    monkeypatch.setenv(variable, "mine.xml")
+    announce_often()
+    assert os.environ[variable] == "mine.xml"
+    monkeypatch.delenv(variable)
+    announce_often()
+    period = ElementTree.parse(os.environ[variable]).find(".//{*}leaseAnnouncement")
+    assert [int(part.text) for part in period] == [0, 500_000_000]

@@ -19,6 +19,7 @@ import sys
 from pathlib import Path
 
 from us_sim.errors import UsSimError
+from us_sim.share import shared_path
 
 # Before NumPy loads its BLAS: several node processes share few cores, and small dense solves are
 # far slower on many threads.
@@ -67,6 +68,15 @@ def require_rclpy() -> None:
             f"of another environment started this one: start it without the variables "
             f"_ROS_WHEELS_BOOTSTRAP_COMPLETE and LD_LIBRARY_PATH"
         )
+
+
+def announce_often() -> None:
+    """Have Fast DDS announce nodes twice a second, not every 3 s, unless a profile is set.
+
+    Nodes that are started again are soon heard.
+    """
+    profile = shared_path("config/fast_dds.xml")
+    os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile))
 
 
 def ros_refusal(error: Exception) -> UsSimError:

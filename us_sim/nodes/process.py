@@ -21,7 +21,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from us_sim.errors import UsSimError
-from us_sim.nodes import INTERRUPTED, ros_refusal
+from us_sim.nodes import INTERRUPTED, announce_often, ros_refusal
 from us_sim.nodes.guarded_node import GuardedNode
 
 COMPUTING, MEASURING = 1, 2
@@ -89,6 +89,7 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     """
     for number in _ENDINGS:
         signal.signal(number, _interrupt_once)
+    announce_often()
     try:
         # rclpy's own handlers shut the context down from a thread, before ours has run: that could
         # then break off the very end of a node, and leave a recording without its index.

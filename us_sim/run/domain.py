@@ -103,8 +103,9 @@ def ros_context(number: int | None = None) -> Context:
     from rclpy.context import Context
     from rclpy.signals import SignalHandlerOptions
 
-    from us_sim.nodes import ros_refusal
+    from us_sim.nodes import announce_often, ros_refusal
 
+    announce_often()
     context, silent = Context(), SignalHandlerOptions.NO
     given = [BEGIN, "--enclave", enclave_of("session_control"), *ros_arguments()]
     try:
