@@ -43,9 +43,7 @@ def vertex_normals(vertices: NDArray[_Real], triangles: ArrayLike) -> NDArray[_R
 def _sum_normals(vertices, triangles, normals):
     """Fills normals (N, 3), zeros before, from vertices (N, 3) and triangles (T, 3)."""
     for t in range(len(triangles)):
-        i = triangles[t, 0]
-        j = triangles[t, 1]
-        k = triangles[t, 2]
+        i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         ax = vertices[j, 0] - vertices[i, 0]
         ay = vertices[j, 1] - vertices[i, 1]
         az = vertices[j, 2] - vertices[i, 2]

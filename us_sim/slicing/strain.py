@@ -88,8 +88,7 @@ def nodal_deformation(
                 + to_pixel[a, 1] * now[n, 1]
                 + to_pixel[a, 2] * now[n, 2]
             )
-    for i in range(len(done)):
-        done[i] = False
+    done[:] = False
     count = len(tetrahedra)
     for s in shown:
         for k in range(4):
@@ -97,10 +96,7 @@ def nodal_deformation(
             if done[count + n]:
                 continue
             done[count + n] = True
-            volume = 0.0
-            first = 0.0
-            mixed = 0.0
-            last = 0.0
+            volume = first = mixed = last = 0.0
             for q in range(starts[n], starts[n + 1]):
                 e = members[q]
                 if not done[e]:
@@ -118,10 +114,7 @@ def nodal_deformation(
 @njit(inline="always", error_model="numpy")
 def _deform(tetrahedra, e, before, place, pixel_volume, steps, deformed):
     """Fills a tetrahedron's row: its volume now in any unit (0 if it is not solid), and c."""
-    n0 = tetrahedra[e, 0]
-    n1 = tetrahedra[e, 1]
-    n2 = tetrahedra[e, 2]
-    n3 = tetrahedra[e, 3]
+    n0, n1, n2, n3 = tetrahedra[e, 0], tetrahedra[e, 1], tetrahedra[e, 2], tetrahedra[e, 3]
     size, to_1, to_2, to_3 = adjugate(place, n0, n1, n2, n3)
     ax = before[n1, 0] - before[n0, 0]
     ay = before[n1, 1] - before[n0, 1]
@@ -134,10 +127,7 @@ def _deform(tetrahedra, e, before, place, pixel_volume, steps, deformed):
     cz = before[n3, 2] - before[n0, 2]
     earlier = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
     if not is_solid(size, pixel_volume, earlier):
-        deformed[e, 0] = 0.0
-        deformed[e, 1] = 0.0
-        deformed[e, 2] = 0.0
-        deformed[e, 3] = 0.0
+        deformed[e] = 0.0
         return
     # How fast the place in the other state changes along the image's columns and rows.
     p = 1.0 / (size * steps[0])

@@ -103,8 +103,7 @@ def track(
         found, correlation = _refine(first, later_window, size, moved)
         moved = _smoothed(found, correlation, size)
     top, bottom = _ends(moved, correlation, window[0] // 2, search)
-    correlation[:top] = 0.0
-    correlation[bottom:] = 0.0
+    correlation[:top] = correlation[bottom:] = 0.0
     return moved, correlation
 
 

@@ -267,10 +267,12 @@ def test_its_middle_follows_the_pulse(gate_scanner, artery):
     blood = Blood([artery])
     frame = gate_scanner.frame(POSE, block().nodes, time=0.0)
     moments = np.arange(100) / 110
-    found = middles(Spectrum(GATE_PROBE, GATE).columns(blood, frame, moments), GATE)
+    columns, seen = Spectrum(GATE_PROBE, GATE).columns(blood, frame, moments)
+    found = middles(columns, GATE)
     blood.at(frame)
     sign = -np.sign(POSE.rotation[1, 2])
     axis = 2 * sign * ARTERY.mean_velocity * artery.pulse(moments) * np.sin(TILT)
+    assert seen.all()
     assert np.corrcoef(found, axis)[0, 1] > 0.995
     fast = np.abs(axis) > 0.1
     assert (found[fast] / axis[fast]).mean() == pytest.approx(0.98, abs=0.04)
@@ -312,3 +314,50 @@ def test_no_column_depends_on_when_frames_come(gate_scanner, artery):
 def test_a_gate_outside_the_image_is_refused(probe, settings, key):
     with pytest.raises(ProbeError, match=key):
         Spectrum(probe, SpectrumSettings(**settings))
+
+
+def strip_of(frame, blood, **given):
+    """A gate's spectrum after it was shown a second of a frame's blood, and whether one is drawn.
+
+    The line at 0 cm/s is drawn always, with a grey of 90.
+    """
+    spectrum = Spectrum(GATE_PROBE, dataclasses.replace(GATE, sweep=1.0, **given))
+    for frame.time in np.arange(1.0, 2.01, 0.05):
+        picture = spectrum.show(blood, frame)
+    return spectrum, np.count_nonzero(picture[:ROWS, :500, 0] > 90) > 100
+
+
+@pytest.mark.parametrize(
+    ("why", "fan", "coupling", "given"),
+    [
+        (Absence.NOTHING, np.radians(4), 1.0, {}),  # nearly across, and drawn all the same
+        (Absence.NOTHING, TILT, 0.2, {}),
+        (Absence.NO_CONTACT, TILT, 0.0, {}),
+        (Absence.NO_VESSEL, TILT, 1.0, {"lateral": 0.45}),
+        (Absence.ACROSS_FLOW, 0.0, 1.0, {"wall_filter": 0.02}),
+        (Absence.TOO_SLOW, np.radians(8), 1.0, {"wall_filter": 0.2}),
+    ],
+)
+def test_why_there_is_no_spectrum_is_told_where_none_is_drawn(
+    gate_scanner, why, fan, coupling, given
+):
+    middle = Pose([0.0, 0.5 * SIDES[2] * np.tan(fan), 0.0])
+    pose = middle @ Pose([0.0] * 3, [np.sin(fan / 2), 0.0, 0.0, np.cos(fan / 2)])
+    frame = gate_scanner.frame(pose, block().nodes, time=1.0)
+    frame.contact = np.full(GATE_PROBE.lines, coupling), np.zeros(GATE_PROBE.lines)
+    depth = 0.5 * SIDES[2] / np.cos(fan)
+    slow = dataclasses.replace(ARTERY, peak_velocity=0.2, mean_velocity=0.05)
+    blood = Blood([tube_vessel(slow if why is Absence.TOO_SLOW else ARTERY)])
+    spectrum, is_drawn = strip_of(frame, blood, depth=depth, **given)
+    assert is_drawn == (why is Absence.NOTHING)
+    assert spectrum.absence(blood, frame) is why
+
+
+def test_there_is_a_spectrum_as_long_as_it_is_on_the_strip(gate_scanner, artery):
+    frame = gate_scanner.frame(POSE, block().nodes, time=1.0)
+    blood = Blood([artery])
+    spectrum, _ = strip_of(frame, blood)
+    frame.contact = np.zeros(GATE_PROBE.lines), np.zeros(GATE_PROBE.lines)
+    for frame.time, why in ((2.5, Absence.NOTHING), (3.1, Absence.NO_CONTACT)):
+        spectrum.show(blood, frame)
+        assert spectrum.absence(blood, frame) is why

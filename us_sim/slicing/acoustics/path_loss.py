@@ -107,8 +107,7 @@ def follow_beams(
         px = py = pz = np.int64(0)
         x = y = z = np.int64(0)
         gx = gy = gz = np.int64(0)
-        column = lines[k, 0]
-        row = lines[k, 1]
+        column, row = lines[k, 0], lines[k, 1]
         to_column = lines[k, 2]
         to_row = lines[k, 3]
         held = np.int32(-2)  # the element whose gradient is gx, gy, gz
@@ -264,9 +263,7 @@ def _fixed(value):
 @njit(inline="always", error_model="numpy")
 def _medium_in(x, y, z, voxels, sides, of_label):
     """The medium of the voxel that fixed-point coordinates lie in, `NOTHING` beyond the volume."""
-    ix = x >> _BITS
-    iy = y >> _BITS
-    iz = z >> _BITS
+    ix, iy, iz = x >> _BITS, y >> _BITS, z >> _BITS
     # Negative ones are very large without a sign.
     is_inside = np.uint64(ix) < np.uint64(sides[0])
     is_inside &= np.uint64(iy) < np.uint64(sides[1])

@@ -114,8 +114,7 @@ def draw_surfaces(
             + gradient[1] * beam_axes[1, 1]
             + gradient[2] * beam_axes[1, 2]
         ) / length
-        dx = directions[k, 0]
-        dz = directions[k, 1]
+        dx, dz = directions[k, 0], directions[k, 1]
         cosine = nx * dx + nz * dz
         size = abs(cosine)
         level -= angles[np.uint64(min(size * 256.0, 256.0))]
@@ -217,15 +216,10 @@ def _carry_normal(normal, element, rest_index, tetrahedra, corners, nodes, rigid
     determinant = ux * (vy * wz - vz * wy) + uy * (vz * wx - vx * wz) + uz * (vx * wy - vy * wx)
     if abs(determinant) < _FLAT:
         return False
-    out[0] = (
-        p * (vy * wz - vz * wy) + q * (wy * uz - wz * uy) + r * (uy * vz - uz * vy)
-    ) / determinant
-    out[1] = (
-        p * (vz * wx - vx * wz) + q * (wz * ux - wx * uz) + r * (uz * vx - ux * vz)
-    ) / determinant
-    out[2] = (
-        p * (vx * wy - vy * wx) + q * (wx * uy - wy * ux) + r * (ux * vy - uy * vx)
-    ) / determinant
+    p, q, r = p / determinant, q / determinant, r / determinant
+    out[0] = p * (vy * wz - vz * wy) + q * (wy * uz - wz * uy) + r * (uy * vz - uz * vy)
+    out[1] = p * (vz * wx - vx * wz) + q * (wz * ux - wx * uz) + r * (uz * vx - ux * vz)
+    out[2] = p * (vx * wy - vy * wx) + q * (wx * uy - wy * ux) + r * (ux * vy - uy * vx)
     return True
 
 

@@ -125,9 +125,7 @@ def cut_tetrahedra(
 @njit(inline="always", error_model="numpy")
 def place_node(nodes, n, to_pixel, place, k):
     """Column, row and height of node ``n``, into row ``k`` of ``place`` (…, 3)."""
-    x = nodes[n, 0]
-    y = nodes[n, 1]
-    z = nodes[n, 2]
+    x, y, z = nodes[n, 0], nodes[n, 1], nodes[n, 2]
     for a in range(3):
         place[k, a] = to_pixel[a, 3] + to_pixel[a, 0] * x + to_pixel[a, 1] * y + to_pixel[a, 2] * z
     if abs(place[k, 2]) <= ON_PLANE:

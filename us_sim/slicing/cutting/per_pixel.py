@@ -153,8 +153,7 @@ def _locate(corners, places, first, last, rest, elements, first_row, end_row):
             for column in range(max(0, first[e, 0]), min(rest.shape[1], last[e, 0] + 1)):
                 if not np.isnan(rest[row, column, 0]):
                     continue
-                pixel[0] = column
-                pixel[1] = row
+                pixel[0], pixel[1] = column, row
                 # A barycentric coordinate is the fraction of the volume with the pixel as a corner.
                 for k in range(4):
                     for a in range(3):

@@ -26,9 +26,7 @@ def adjugate(place, n0, n1, n2, n3):
     Args:
         place: (N, 3) column, row and height above the plane. n0 … n3: which four are the corners.
     """
-    x0 = place[n0, 0]
-    y0 = place[n0, 1]
-    z0 = place[n0, 2]
+    x0, y0, z0 = place[n0, 0], place[n0, 1], place[n0, 2]
     ax = place[n1, 0] - x0
     ay = place[n1, 1] - y0
     az = place[n1, 2] - z0

@@ -229,8 +229,7 @@ def _write_clipped(m, shape, row, first, end, x, y, z):
             z[i] = _held(m[2, 0] + m[2, 2] * row + m[2, 1] * i, shape[2])
         else:
             x[i] = _NOWHERE
-            y[i] = 0
-            z[i] = 0
+            y[i] = z[i] = 0
 
 
 @njit(inline="always", error_model="numpy")
@@ -251,8 +250,7 @@ def _write_rigid(m, shape, row, first, end, covered, x, y, z):
             _write_clipped(m, shape, row, start, i, x, y, z)
         elif x[i] == _OPEN:
             x[i] = _NOWHERE
-            y[i] = 0
-            z[i] = 0
+            y[i] = z[i] = 0
             i += 1
         else:
             i += 1

@@ -117,9 +117,7 @@ def _find_velocity(
         beam_x, beam_z: (P,) the beams' directions. corner: (3,) voxels.
         station: (i, j, k). offset: (i, j, k, 2). axis: (S, 2) m/s along the probe's x and z.
     """
-    last_i = station.shape[0] - 2
-    last_j = station.shape[1] - 2
-    last_k = station.shape[2] - 2
+    last_i, last_j, last_k = station.shape[0] - 2, station.shape[1] - 2, station.shape[2] - 2
     most = len(axis) - 2
     for p in range(len(pixel)):
         if pixel[p] < 0:
@@ -127,8 +125,7 @@ def _find_velocity(
         e = elements[pixel[p]]
         if e < 0:
             continue
-        column = np.float64(columns[p])
-        row = np.float64(rows[p])
+        column, row = np.float64(columns[p]), np.float64(rows[p])
         u = maps[e, 0, 0] + maps[e, 0, 1] * column + maps[e, 0, 2] * row - corner[0]
         if not 0.0 <= u <= last_i + 1:
             continue
@@ -136,9 +133,7 @@ def _find_velocity(
         w = maps[e, 2, 0] + maps[e, 2, 1] * column + maps[e, 2, 2] * row - corner[2]
         if not (0.0 <= v <= last_j + 1 and 0.0 <= w <= last_k + 1):
             continue
-        i = min(np.int64(u), last_i)
-        j = min(np.int64(v), last_j)
-        k = min(np.int64(w), last_k)
+        i, j, k = min(np.int64(u), last_i), min(np.int64(v), last_j), min(np.int64(w), last_k)
         across = _blended(offset[..., 0], i, j, k, u - i, v - j, w - k)
         down = _blended(offset[..., 1], i, j, k, u - i, v - j, w - k)
         r = across * across + down * down

@@ -218,19 +218,22 @@ class ColourDoppler:
         self._noise_shape = np.maximum(1, np.ceil(self._within.shape / size)).astype(int)
 
 
+@njit(inline="always", error_model="numpy")
+def _passed(v, nyquist, wall):
+    """The part of a velocity's power that the wall filter lets through, whose input is aliased."""
+    fast = (v - 2.0 * nyquist * np.round(v / (2.0 * nyquist))) ** 4
+    return fast / (fast + wall**4) if fast > 0.0 else 0.0
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _turn(velocity, nyquist, wall, turned):
     """Fills turned (rows, columns, 2): real and imaginary part of a place's R, without noise."""
     for row in range(velocity.shape[0]):
         for column in range(velocity.shape[1]):
             v = velocity[row, column]
-            turned[row, column, 0] = 0.0
-            turned[row, column, 1] = 0.0
+            turned[row, column, 0] = turned[row, column, 1] = 0.0
             if not np.isnan(v):
-                # The filter's input is aliased, too.
-                seen = v - 2.0 * nyquist * np.round(v / (2.0 * nyquist))
-                fast = seen**4
-                weight = fast / (fast + wall**4) if fast > 0.0 else 0.0
+                weight = _passed(v, nyquist, wall)
                 angle = np.pi * v / nyquist
                 turned[row, column, 0] = weight * np.cos(angle)
                 turned[row, column, 1] = weight * np.sin(angle)
@@ -254,8 +257,7 @@ def _show(turned, noise, within, nyquist, least, broadening, receiver, shown):
         for column in range(within.shape[1]):
             if not within[row, column]:
                 continue
-            x = turned[row, column, 0]
-            y = turned[row, column, 1]
+            x, y = turned[row, column, 0], turned[row, column, 1]
             scale = broadening * np.sqrt(x * x + y * y) + receiver
             x += scale * noise[row, column, 0]
             y += scale * noise[row, column, 1]
@@ -273,6 +275,7 @@ velocity itself."""
 _DRAWN = 3e-3  # length of the lines that show the gate, m
 _NOISE = 1e-4
 """The receiver's power in a bin, over that of a gate full of blood of one slow velocity."""
+_CLEAR = 4.0  # power of blood, over that of noise and black, from which it can be told from them
 
 
 class Spectrum:
@@ -307,11 +310,12 @@ class Spectrum:
         self._picture = SweepPicture(
             _ROWS, _COLUMNS, settings.sweep, (float(shown[0]), float(shown[1]), "cm/s")
         )
+        self._seen = -math.inf  # s, time of the newest column in which blood is seen
 
     def go_on(self, before: Spectrum) -> None:
         """Go on with the picture of a gate that looked elsewhere, if its scales are the same."""
         if before._picture.layout == self._picture.layout:
-            self._picture = before._picture
+            self._picture, self._seen = before._picture, before._seen
 
     def show(self, blood: Blood, frame: Frame) -> NDArray[np.uint8]:
         """The picture (rows, columns, 3) up to the frame, with its scales.
@@ -319,32 +323,39 @@ class Spectrum:
         Between two frames the tissue is taken to be as in the later one; the pulse is not.
         """
         moments = self._picture.moments(frame.time)
-        self._picture.add(self.columns(blood, frame, moments))
+        columns, seen = self.columns(blood, frame, moments)
+        self._picture.add(columns)
+        self._seen = moments[seen].max(initial=self._seen)
         return self._picture.drawn()
 
     def absence(self, blood: Blood, frame: Frame) -> Absence:
-        """Why this frame has no flow at the gate; nothing where it has."""
+        """Why the picture up to this frame shows no blood; nothing where it does."""
+        if 0.0 <= frame.time - self._seen < self.settings.sweep:
+            return Absence.NOTHING
         lines = np.full(self._window.shape, self._line)
         return absence(blood, frame, self._window, lines, self.settings.wall_filter)
 
     def columns(
         self, blood: Blood, frame: Frame, moments: NDArray[np.float64]
-    ) -> NDArray[np.uint8]:
-        """Grey spectra (rows, K) at times (K,) s, the fastest towards the probe on top."""
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Grey spectra (rows, K) at times (K,) s, the fastest towards the probe on top.
+
+        And (K,) whether blood is seen in them: brighter than black, and than the noise.
+        """
         settings = self.settings
         means, which = blood.mean_velocities(frame, self._window)
         pulses = np.array([vessel.pulse(moments) for vessel in blood.vessels])
         velocities = means[None] * pulses[which].T  # where there is no vessel the mean is NaN
-        power = np.empty((_ROWS, len(moments)))
+        power, peak = np.empty((_ROWS, len(moments))), np.empty(len(moments))
         seeds = np.rint(moments * 1e6).astype(np.uint64)
         heard = 1.0 if frame.contact is None else float(frame.contact[0][self._line]) ** 2
         _fill_spectra(
             velocities, settings.nyquist_velocity, self._lowest, settings.wall_filter, heard,
-            seeds, power,
+            seeds, power, peak,
         )  # fmt: skip
-        level = 10.0 * np.log10(power) + settings.gain
-        grey = 255.0 * (1.0 + level / settings.dynamic_range)
-        return np.asarray(np.clip(grey, 0.0, 255.0).astype(np.uint8)[::-1])
+        black = 10.0 ** (-0.1 * (settings.dynamic_range + settings.gain))
+        grey = 2550.0 / settings.dynamic_range * np.log10(power / black)
+        return np.clip(grey, 0.0, 255.0).astype(np.uint8)[::-1], peak > _CLEAR * max(black, _NOISE)
 
 
 def _gate_lines(
@@ -369,10 +380,11 @@ def _gate_lines(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_spectra(velocities, nyquist, lowest, wall, heard, seeds, power):
-    """Fills power (rows, K) from velocities (K, P), NaN outside blood; row 0 is ``lowest``.
+def _fill_spectra(velocities, nyquist, lowest, wall, heard, seeds, power, peak):
+    """Fills power (rows, K) and peak (K,), its most without noise; row 0 is ``lowest``.
 
     Args:
+        velocities: (K, P), NaN outside blood.
         heard: power of blood's echoes that the probe hears. seeds: (K,) of the noise.
     """
     rows = power.shape[0]
@@ -391,15 +403,15 @@ def _fill_spectra(velocities, nyquist, lowest, wall, heard, seeds, power):
             first = np.int64(np.floor(middle)) - reach
             # The narrowest spectrum has power 1 where it is highest.
             height = heard * nyquist * _LEAST_BROADENING / sigma / places
+            height *= _passed(v, nyquist, wall)
             for r in range(first, first + 2 * reach + 2):
                 apart = (r - middle) * per_row / sigma
                 power[r % rows, k] += height * np.exp(-0.5 * apart * apart)
+        peak[k] = 0.0
         for r in range(rows):
-            seen = lowest + (r + 0.5) * per_row
-            fast = (seen - 2.0 * nyquist * np.round(seen / (2.0 * nyquist))) ** 4
-            passed = fast / (fast + wall**4) if fast > 0.0 else 0.0
             speckle = -np.log(uniform(seeds[k], np.uint64(r)))
-            power[r, k] = (power[r, k] * passed + _NOISE) * speckle
+            peak[k] = max(peak[k], power[r, k])
+            power[r, k] = (power[r, k] + _NOISE) * speckle
 
 
 _FOLLOWING_STEP = 6  # pixels from one place that is looked at to the next
