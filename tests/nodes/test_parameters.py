@@ -85,6 +85,11 @@ def attempt(node: Any, name: str, value: object) -> Any:
     return node.set_parameters([Parameter(name, value=value)])[0]
 
 
+def highest(parameter, rule):
+    """The end of a number's range; the image's is where a linear probe hears echoes no more."""
+    return 0.115 if parameter == "depth" else rule.quantity.maximum
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NODES)
 def test_every_setting_is_shown_and_only_what_may_change_can_be_set(bench, scene, tmp_path, name):
@@ -108,7 +113,7 @@ def test_every_setting_is_shown_and_only_what_may_change_can_be_set(bench, scene
         if ranges:
             low = min(0.0, rule.quantity.minimum) if kind != kinds_of(settings)[field] else None
             assert ranges[0].from_value == (rule.quantity.minimum if low is None else low)
-            assert ranges[0].to_value == rule.quantity.maximum
+            assert ranges[0].to_value == highest(parameter, rule)
         assert shown.read_only is not is_live(settings, field)
         if shown.read_only:
             value = node.get_parameter(parameter).value
@@ -130,7 +135,7 @@ def test_what_may_change_is_taken_in_its_range_and_refused_outside(bench, scene,
         before = node.get_parameter(parameter).value
         quantity = rule.quantity
         if kind in (int, float):
-            low, high = quantity.minimum, quantity.maximum
+            low, high = quantity.minimum, highest(parameter, rule)
             for value in (kind(low - abs(low) - 1), kind(high + abs(high) + 1)):
                 refused = attempt(node, parameter, value)
                 assert not refused.successful, parameter

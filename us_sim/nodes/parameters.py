@@ -40,7 +40,7 @@ def declared(node: Node, settings: S, names: Collection[str] | None = None, pref
     cls = type(settings)
     chosen = [name for name in rules_of(cls) if names is None or name in names]
     given = [
-        node.declare_parameter(prefix + name, _raw(settings, name), _descriptor(cls, name))
+        node.declare_parameter(prefix + name, _raw(settings, name), _descriptor(settings, name))
         for name in chosen
     ]
     return changed(settings, given, prefix, f"{node.get_name()}.")
@@ -153,15 +153,15 @@ def _raw(settings: Settings, name: str) -> Any:
     return parameter_value(kinds_of(type(settings))[name], getattr(settings, name))
 
 
-def _descriptor(settings: type[Settings], name: str) -> ParameterDescriptor:
+def _descriptor(settings: Settings, name: str) -> ParameterDescriptor:
     """The description of a setting that `ros2 param describe` shows.
 
     What ROS has no field for is a JSON object in ``additional_constraints``: ``unit`` (SI),
     ``shown_in`` (the unit on a dial), ``choices`` (their meanings by name, as far as told),
     ``none`` (the value that stands for none), ``live`` (whether it may change while the node runs).
     """
-    rule, kind = rules_of(settings)[name], kinds_of(settings)[name]
-    live = is_live(settings, name)
+    rule, kind = rules_of(type(settings))[name], kinds_of(type(settings))[name]
+    live = is_live(type(settings), name)
     told: dict[str, Any] = {"live": live}
     if rule.quantity and rule.quantity.unit:
         told |= {"unit": rule.quantity.unit, "shown_in": dial_unit(rule.quantity)}
@@ -177,7 +177,7 @@ def _descriptor(settings: type[Settings], name: str) -> ParameterDescriptor:
         dynamic_typing=kind is str and not live,
     )
     if rule.quantity is not None:  # ROS has no range for lists
-        low, high = rule.quantity.minimum, rule.quantity.maximum
+        low, high = rule.quantity.minimum, settings.get_upper_limit(name)
         kinds = get_args(kind) if may_be_none(kind) else (kind,)
         low = min(low, 0.0) if may_be_none(kind) else low
         if float in kinds:

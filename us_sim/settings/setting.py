@@ -130,6 +130,10 @@ class Settings:
         wanted = " or ".join(values)
         return "" if chosen in values else f"is for {other} {wanted} only, not {chosen}"
 
+    def get_upper_limit(self, name: str) -> float:
+        """The end of the range of a number beside the other settings."""
+        return rules_of(type(self))[name].quantity.maximum  # type: ignore[union-attr]
+
     def check(self) -> None:
         """Refuse values that do not go together."""
 

@@ -1,5 +1,6 @@
 """Pixels, beams, outlines and places of each kind of transducer, in millimetres."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -20,7 +21,7 @@ DEGREE = math.pi / 180
 
 pixel_count = st.integers(1, 90)
 numbers = {
-    "depth": st.floats(0.01, 0.3),
+    "depth": st.floats(0.01, 0.11),
     "columns": pixel_count,
     "rows": pixel_count,
     "lines": st.integers(1, 40),
@@ -264,6 +265,19 @@ def test_wires_appear_at_their_millimetre(name):
 def test_a_geometry_that_cannot_be_is_refused(make, words):
     with pytest.raises(ProbeError, match=words):
         make()
+
+
+@pytest.mark.parametrize(
+    ("frequencies", "deepest"), [((4e6, 16e6), 0.115), ((2e6, 5e6), 0.29), ((1e6, 2e6), 0.4)]
+)
+def test_an_image_ends_where_a_probe_of_its_frequencies_hears_no_echoes(frequencies, deepest):
+    made = LinearProbe(aperture=0.04, depth=deepest, frequencies=frequencies)
+    assert made.get_upper_limit("depth") == made.greatest_depth == deepest
+    assert made.get_upper_limit("focus") == 0.4
+    if deepest < 0.4:
+        words = f"probe.depth: 400 mm is more than the {1e3 * deepest:g} mm .*probe.frequencies"
+        with pytest.raises(ProbeError, match=words):
+            dataclasses.replace(made, depth=0.4)
 
 
 @pytest.mark.parametrize(

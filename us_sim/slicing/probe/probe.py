@@ -69,6 +69,8 @@ _ROUNDING = 1e-9
 """Tolerance for pixel centres on the outline, over the depth and over the number of lines."""
 
 _BAND = 64  # rows
+_LOSS = 1.08e-4  # dB/m/Hz there and back through soft tissue: 0.54 dB/cm/MHz each way
+_WEAKEST = 100.0  # dB: a loss beyond which the strongest echo is below a scanner's noise
 
 
 class Probe(Settings, ABC):
@@ -113,6 +115,15 @@ class Probe(Settings, ABC):
         made: Any = self
         probe: Self = dataclasses.replace(made, columns=columns, rows=rows)
         return probe
+
+    @property
+    def greatest_depth(self) -> float:
+        """m, from where echoes come back at the middle of its frequencies; below it is noise."""
+        within = _WEAKEST / (_LOSS * math.sqrt(math.prod(self.frequencies)))
+        return min(0.4, math.floor(within * 200) / 200)
+
+    def get_upper_limit(self, name: str) -> float:
+        return self.greatest_depth if name == "depth" else super().get_upper_limit(name)
 
     @property
     @abstractmethod
@@ -253,7 +264,7 @@ class Probe(Settings, ABC):
         return (np.arange(self.lines) + 0.5) / self.lines
 
     def check(self) -> None:
-        """Refuse an image that is too large.
+        """Refuse an image that is too large, or too deep.
 
         Raises:
             ProbeError: with the key, the value and the range.
@@ -262,6 +273,13 @@ class Probe(Settings, ABC):
         if low > high:
             raise self.refused(
                 "frequencies", f"{low:g} to {high:g} Hz go down: give the lower one first"
+            )
+        most = self.greatest_depth
+        if self.depth > most:
+            raise self.refused(
+                "depth",
+                f"{1e3 * self.depth:g} mm is more than the {1e3 * most:g} mm from which "
+                f"echoes of {low * 1e-6:g} to {high * 1e-6:g} MHz come back (probe.frequencies)",
             )
         try:
             require_pixel_counts(self.columns, self.rows)

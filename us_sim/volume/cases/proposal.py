@@ -82,9 +82,9 @@ def _pose_above(points: NDArray[np.float64], volume: Volume) -> Pose:
 
 
 def _probe_at(pose: Pose, points: NDArray[np.float64]) -> ProbeSettings:
-    """A linear array as wide and deep as what was scanned, up to 50 mm and 250 mm."""
+    """A linear array as wide and deep as what was scanned, up to 50 mm and 110 mm."""
     x, _, z = np.abs((points - pose.position) @ pose.rotation).T
-    depth = float(np.clip(np.percentile(z, 99.5), 0.01, 0.25))
+    depth = float(np.clip(np.percentile(z, 99.5), 0.01, 0.11))
     aperture = float(np.clip(2 * np.percentile(x, 99.0), 5e-3, 0.05))
     made: Any = PROBES.settings("linear")
     array = Chosen("linear", made(aperture=aperture, depth=round(depth, 4)))
