@@ -141,7 +141,7 @@ def test_the_badge_stands_in_a_frame_of_its_colour_and_the_image_stays():
     st.integers(0, 2**32 - 1),
 )
 def test_a_picture_of_any_size_has_everything_inside(columns, rows, aperture, depth, text, seed):
-    probe = LinearProbe(aperture=aperture, depth=depth, columns=columns, rows=rows, focus=4e-3)
+    probe = LinearProbe(aperture, depth, columns, rows, focus=4e-3, frequencies=(1e6, 2e6))
     labels = np.random.default_rng(seed).integers(0, 3, (rows, columns), dtype=np.uint8)
     labels[rows // 3 : rows // 2, columns // 3 :] = 1
     annotation = Annotation(probe, {1: ("artery", (1.0, 0.0, 0.0)), 2: ("bone", (0.0, 1.0, 0.0))})
