@@ -11,6 +11,7 @@ import numpy as np
 from us_sim.command.volume_pictures import draw_slices
 from us_sim.errors import VolumeError
 from us_sim.settings.setting import Settings, setting
+from us_sim.volume.cases.proposal import on_skin
 from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.writing import VOLUME_ENDINGS, write_volume
@@ -118,8 +119,9 @@ def reconstruct_sweep(
     else:
         with new_case(settings.out) as folder:
             write_volume(folder / "volume.nrrd", made.volume)
-            # Where the pressure is undone no pose is one that was scanned from.
-            scanned = () if planned.rest else scanner.poses
+            scanned = scanner.poses
+            if planned.rest:  # what they pressed lies at rest
+                scanned = tuple(on_skin(each, made.volume, scanner.probe) for each in scanned)
             case = CaseSettings(name=settings.out.name, probe=scanner.probe, scanned=scanned)
             write_case_settings(folder, case)
             draw_slices(folder / picture.name, made.volume, made.covered, size)

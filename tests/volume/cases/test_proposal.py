@@ -1,14 +1,20 @@
 """Where to start: a pose that was scanned from, or above the middle of what was."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from us_sim.errors import CaseError
-from us_sim.geometry.pose import Placement
-from us_sim.volume.cases.proposal import with_proposal
+from us_sim.geometry.pose import Placement, Pose
+from us_sim.geometry.transducer import ProbeSettings
+from us_sim.settings.choice import Chosen
+from us_sim.settings.registry import PROBES
+from us_sim.volume.cases.proposal import on_skin, with_proposal
 from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.volume import Volume
 
+linear = PROBES.settings("linear")
 VEIN = {"vein": CaseStructure(3)}
 
 
@@ -53,6 +59,57 @@ def test_without_poses_a_linear_array_looks_along_the_columns_of_the_images():
     assert made.probe.geometry == "linear"
     assert made.probe.collider.name == "rounded_box"
     assert (array.aperture, array.depth) == pytest.approx((0.038, 0.048), abs=3e-3)
+
+
+def curved_block(bend: float) -> Volume:
+    """60 mm wide, 50 mm deep and 40 mm of elevation; skin 20 mm below its top where x is -10 mm.
+
+    Args:
+        bend: m, by which the skin is deeper 20 mm aside; negative is higher.
+    """
+    grid = np.zeros((4, 4))
+    grid[0, 0] = grid[2, 1] = grid[1, 2] = 1e-3
+    grid[:3, 3] = (-0.03, -0.02, 0.0)
+    grid[3, 3] = 1.0
+    x, depth = 1e-3 * np.arange(60) - 0.03, 1e-3 * np.arange(50)
+    skin = 0.02 + bend * ((x + 0.01) / 0.02) ** 2
+    grey = np.where(depth[None, :] >= skin[:, None], 90, 0).astype(np.uint8)
+    grey[20:40:5, 3] = 60  # specks
+    return Volume(np.repeat(grey[:, :, None], 40, axis=2), grid)
+
+
+def skin_under(start: Placement, volume: Volume, half: float) -> float:
+    """mm, how far below the face (negative: above) the skin is where it is nearest."""
+    x = np.linspace(-half, half, 51)
+    nearest = []
+    for depth in np.arange(-0.03, 0.03, 2e-4):
+        points = start.pose.apply(np.column_stack([x, 0 * x, 0 * x + depth]))
+        index = np.rint(points @ volume.patient_to_index[:3, :3].T + volume.patient_to_index[:3, 3])
+        kept = ((index >= 0) & (index < volume.shape)).all(axis=1)
+        seen = volume.intensities[tuple(index[kept].astype(int).T)] == 90
+        if seen.any():
+            nearest.append(depth)
+    return 1e3 * min(nearest)
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.004, 0.01, -0.008])
+def test_the_face_touches_skin_that_is_curved(bend):
+    volume = curved_block(bend)
+    probe = ProbeSettings(Chosen("linear", linear(aperture=0.03, depth=0.03)))
+    for said in ({}, {"probe": probe}):
+        made = with_proposal(CaseSettings("a", **said), volume)
+        half = made.probe.array.given.aperture / 2
+        assert skin_under(made.start, volume, half) == pytest.approx(0.0, abs=1.0)  # a voxel
+
+
+@pytest.mark.parametrize("depth", [0.010, 0.026])
+def test_a_pose_above_or_inside_is_put_on_the_skin_along_its_own_axis(depth):
+    turn = Pose(orientation=[-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])  # its z is the volume's y
+    volume = curved_block(0.0)
+    volume = replace(volume, index_to_patient=turn.matrix @ volume.index_to_patient)
+    start = turn @ Pose([0.0, 0.0, depth])
+    moved = on_skin(Placement(tuple(start.position), tuple(start.orientation)), volume, None)
+    np.testing.assert_allclose(moved.position, turn.apply(np.array([[0, 0, 0.0195]]))[0], atol=5e-4)
 
 
 def test_where_nothing_was_scanned_nothing_is_proposed():

@@ -3,7 +3,8 @@
 A case that knows where it was scanned from starts at one of these poses, so that its first image
 is one that was really seen: the middle one, or the one that shows most of the structures. Any
 other volume is taken for one that a linear array has scanned: its first axis lies along the array,
-and its second one, along the columns of its images, goes into the body.
+and its second one, along the columns of its images, goes into the body. There the face touches
+what was scanned, wherever that begins below it.
 """
 
 from __future__ import annotations
@@ -14,21 +15,23 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from us_sim.errors import CaseError
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Placement, Pose
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.choice import Chosen
 from us_sim.settings.registry import COLLIDERS, PROBES
 from us_sim.tissue.elasticity.material import LAYERS, kind_of
 from us_sim.volume.cases.settings import CaseSettings, CaseStart
-from us_sim.volume.volume import Volume
+from us_sim.volume.volume import Volume, grid_extent
 
 _MOST_POINTS = 1_000_000
 _SLID, _SHOWN = 4e-3, 6e-3
 """m: the press slides 8 mm along y; its middle, and half of what it shows."""
+_FLAT = 0.01  # m, in the middle of a curved face, that counts as flat
 _BETTER = 1.02  # times as much in the image, for which another pose is preferred
 
 
@@ -46,11 +49,13 @@ def with_proposal(settings: CaseSettings, volume: Volume) -> CaseSettings:
         raise CaseError("all voxels of the volume are 0, so there is nothing to scan")
     if start is None or start.proposed:
         poses = [each.pose for each in settings.scanned] or [_pose_above(points, volume)]
-        probe = probe or _probe_at(poses[len(poses) // 2], points)
-        pose = _showing_most(settings, volume, poses, probe)
+        seen_by = probe or _probe_at(poses[len(poses) // 2], points)
+        pose = _showing_most(settings, volume, poses, seen_by)
         x, y, z = (round(float(value), 5) for value in pose.position)
         a, b, c, d = (round(float(value), 6) for value in pose.orientation)
-        start = CaseStart((x, y, z), (a, b, c, d), proposed=True)
+        at = Placement((x, y, z), (a, b, c, d))
+        at = at if settings.scanned else on_skin(at, volume, seen_by)
+        start = CaseStart(at.position, at.orientation, proposed=True)
     probe = probe or _probe_at(start.pose, points)
     if probe.collider is None:
         probe = dataclasses.replace(probe, collider=proposed_collider(probe.array))
@@ -89,6 +94,32 @@ def _probe_at(pose: Pose, points: NDArray[np.float64]) -> ProbeSettings:
     made: Any = PROBES.settings("linear")
     array = Chosen("linear", made(aperture=aperture, depth=round(depth, 4)))
     return ProbeSettings(array=array, image=512)
+
+
+def on_skin(start: Placement, volume: Volume, probe: ProbeSettings | None) -> Placement:
+    """Move a probe along its z to where its face touches what was scanned, and presses nothing.
+
+    Specks, below which there is mostly nothing within 2 mm, do not hold it off.
+    """
+    array: Any = probe and probe.array.settings(PROBES)
+    half, pose = getattr(array, "aperture", _FLAT) / 2, start.pose
+    matrix = pose.inverse().matrix @ volume.index_to_patient
+    step = 0.5 * float(np.linalg.norm(matrix[:3, :3], axis=0).min())
+    shallowest, deepest = grid_extent(matrix, volume.shape)[:, 2].tolist()
+    depths = np.arange(shallowest, deepest, step)
+    rays = np.meshgrid(np.linspace(-half, half, 21), [-2e-3, 0.0, 2e-3], depths, indexing="ij")
+    places = pose.apply(np.stack(rays, axis=-1).reshape(-1, 3))
+    to_index = volume.patient_to_index
+    index = np.rint(places @ to_index[:3, :3].T + to_index[:3, 3]).astype(np.int64)
+    scanned = np.asarray(((index >= 0) & (index < volume.shape)).all(axis=1))
+    scanned[scanned] = volume.intensities[tuple(index[scanned].T)] > 0
+    lines = scanned.reshape(-1, len(depths))
+    behind = sliding_window_view(lines, min(math.ceil(2e-3 / step), len(depths)), axis=1)
+    is_skin = lines[:, : behind.shape[1]] & (behind.mean(axis=2) > 0.5)
+    touched = np.flatnonzero(is_skin.any(axis=0))
+    depth = depths[touched[0]] if len(touched) else 0.0
+    x, y, z = (round(float(value), 5) for value in pose.apply(np.array([[0.0, 0.0, depth]]))[0])
+    return Placement((x, y, z), start.orientation)
 
 
 def _showing_most(
