@@ -20,6 +20,7 @@ from us_sim.scene.reading import load_scene, parse_scene
 from us_sim.slicing.cutting.slicer import create_slicer
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe
 from us_sim.tissue.solvers.solver import create_solver
+from us_sim.volume.cases.case import read_case
 from us_sim.volume.files.readers import read_volume
 from us_sim.volume.files.writing import write_volume
 from us_sim.volume.reconstruction.reconstruction import plan, reconstruct
@@ -121,6 +122,11 @@ def test_the_command_places_images_at_rest(pressed, small_scene, tmp_path, capsy
     made = reconstruct(plan(sweep, how, rest=rest))
     np.testing.assert_array_equal(read_volume(out).intensities, made.volume.intensities)
     assert made.volume.shape[2] > 40  # the probe's depth of 40 mm, and what it had pressed down
+    words[words.index(str(out))] = str(tmp_path / "rest")
+    assert main([*words, "--undo-pressure", str(small_scene)]) == 0
+    start = read_case(tmp_path / "rest").settings.start
+    assert start.position[2] == pytest.approx(0.0, abs=1e-3)  # not where it had pressed
+    np.testing.assert_allclose(start.pose.rotation, np.eye(3), atol=1e-6)
 
 
 PROBE = {"aperture": "40 mm", "depth": "40 mm", "image": [200, 200]}

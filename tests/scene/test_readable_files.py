@@ -6,9 +6,12 @@ import SimpleITK
 
 from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
+from us_sim.run.plan import prepare_scene
 from us_sim.scene.reading import check_files, load_scene, parse_scene
 from us_sim.share import shared_path
 from us_sim.tracking.calibration.transform_file import write_transform
+from us_sim.volume.files.writing import write_volume
+from us_sim.volume.volume import Volume
 
 TETRAHEDRON = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n"
 TETRAHEDRON += "$Nodes\n4\n1 0 0 0\n2 50 0 0\n3 0 50 0\n4 0 0 50\n$EndNodes\n"
@@ -84,20 +87,42 @@ def test_a_recording_in_place_of_a_tracker_is_read_too(tmp_path):
         check_files(load_scene(file))
 
 
+NOWHERE = "tissue: null\nimaging: null\nskin: null\nstructures: null\nvolume: {{file: grey.mha}}\n"
+FLOW = "{{kind: venous, direction: [0, 1, 0], peak_velocity: 0.3, mean_velocity: 0.1}}"
+
+
 @pytest.mark.parametrize(
     ("more", "found"),
     [
         ("structures: {{kidney: {{}}}}", r"structures\.kidney: the volume has no label `kidney`"),
-        ("exercise: {}/kidney.yaml", "exercise: .* is with kidney, which the volume lacks"),
+        (f"structures: {{{{kidney: {{{{flow: {FLOW}}}}}}}}}", r"structures\.kidney: "),
+        ("structures: {{a: {{label: kidney}}}}", r"structures\.a\.label: .*`kidney`"),
+        ("tissue: {{materials: {{kidney: {{young_modulus: 1e4}}}}}}", r"tissue\.materials\.kidney"),
+        ("tissue: {{fixed: [bottom, kidney]}}", r"tissue\.fixed\[1\]: .*`kidney`"),
+        (
+            "imaging: {{acoustics: {{tissues: {{kidney: {{fibres: [0, 1, 0]}}}}}}}}",
+            r"tissues\.kidney: ",
+        ),
+        ("episode: {{target: kidney}}", r"episode\.target: .*kidney"),
+        ("exercise: {}/kidney.yaml", r"exercise: .*kidney\.yaml is with kidney, which"),
+        ("exercise: {}/bone.yaml", r"exercise: .*bone\.yaml is with bone, which is no vessel"),
+        (f"{NOWHERE}exercise: {{}}/kidney.yaml", "exercise: .* is with kidney, .* has none"),
+        (f"{NOWHERE}episode: {{{{target: kidney}}}}", r"episode\.target: .*kidney"),
     ],
 )
 def test_a_structure_that_the_volume_lacks_is_named(tmp_path, more, found):
-    exercise = "name: Find it\ndescription: Find it.\ntask: {kind: centre, structure: kidney}\n"
-    (tmp_path / "kidney.yaml").write_text(exercise, encoding="utf-8")
+    for name in ("kidney", "bone"):
+        exercise = f"name: Find it\ntask: {{kind: centre, structure: {name}}}\n"
+        (tmp_path / f"{name}.yaml").write_text(exercise, encoding="utf-8")
+    grey = np.ones((4, 4, 4), np.uint8)
+    write_volume(tmp_path / "grey.mha", Volume(grey, np.diag([1e-2, 1e-2, 1e-2, 1.0])))
     file = tmp_path / "scene.yaml"
     file.write_text(f"based_on: upper_arm\n{more.format(tmp_path)}\n", encoding="utf-8")
-    with pytest.raises(UsSimError, match=found):
-        check_files(load_scene(file))
+    scene = load_scene(file)
+    for refuse in (check_files, prepare_scene):
+        with pytest.raises(UsSimError, match=f"{file}: .*{found}") as refused:
+            refuse(scene)
+        assert "\n" not in str(refused.value)
 
 
 def test_a_label_without_a_material_is_named_before_the_volume_is_made(tmp_path):

@@ -21,6 +21,7 @@ from us_sim.nodes.settings import RECORDER, VIEWER, SessionRecorderSettings, che
 from us_sim.progress import late_progress
 from us_sim.run.domain import enclave_of, namespace, ros_arguments
 from us_sim.scene.building import path_of, volume_of
+from us_sim.scene.reading import check_names
 from us_sim.scene.scene import Scene
 from us_sim.settings.setting import rules_of
 from us_sim.settings.viewer import TOKEN, ViewerSettings
@@ -248,8 +249,10 @@ def prepare_scene(scene: Scene, path: Path | None = None, topic: str | None = No
     notice damage.
 
     Raises:
-        UsSimError: the volume cannot be read, or no image along the path shows any of it.
+        UsSimError: the volume cannot be read, lacks what the scene names, or no image along the
+            path shows any of it.
     """
+    check_names(scene)
     phantom = scene.volume.phantom
     if path is None and phantom is not None:
         from us_sim.volume.phantom.phantom import is_phantom_kept

@@ -25,6 +25,7 @@ from us_sim.errors import BagError, ProbeError, SceneError, TrackingError, UsSim
 from us_sim.geometry.pose import Placement, Pose
 from us_sim.scene.scene import Scene, TissueSettings
 from us_sim.settings.registry import COLLIDERS, PROBES, TRACKERS
+from us_sim.slicing.acoustics.settings import AROUND
 from us_sim.tracking.measurement import PATIENT
 from us_sim.volume.structure_names import Colour, anatomical_colour
 
@@ -183,10 +184,9 @@ def tissue_model_of(
     section = scene.tissue
     if section is None:
         raise SceneError(f"{scene.origin}: tissue: is missing")
-    if scene.structures:
-        require_labels(scene, volume.label_names)
+    require_labels(scene, volume.label_names)
     mesh, remarks, fractions = _mesh(scene, section, volume)
-    fixed, held = _fixed_nodes(scene, section, mesh, volume, fractions)
+    fixed, held = _fixed_nodes(section, mesh, volume, fractions)
     if note is not None:
         for remark in (*remarks, *held):
             note(f"tissue mesh: {remark}")
@@ -242,8 +242,6 @@ def require_materials(
     """Check that each label has a material, and each material a label.
 
     Args:
-        scene: of which it is told.
-        materials: by label name.
         label_names: by number; None where the volume has no labels, and needs one material.
 
     Raises:
@@ -332,7 +330,6 @@ def _mesh(
 
 
 def _fixed_nodes(
-    scene: Scene,
     section: TissueSettings,
     mesh: TetrahedralMesh,
     volume: Volume,
@@ -348,13 +345,9 @@ def _fixed_nodes(
         if name in FACES:
             margin = section.mesh.margin if section.mesh.file else 0.0  # a box has faces
             held = face_nodes(mesh, name, margin)
-        elif name in numbers and fractions is not None:
-            held = nodes_in_label(mesh, fractions, numbers[name])
         else:
-            raise SceneError(
-                f"{scene.origin}: tissue.fixed: `{name}` is neither a face ({', '.join(FACES)}) "
-                f"nor a label of the volume ({', '.join(numbers) or 'it has none'})"
-            )
+            assert fractions is not None  # the volume has labels: see `require_labels`
+            held = nodes_in_label(mesh, fractions, numbers[name])
         fixed[held] = True
         remark = held_remark(name, held, mesh)
         remarks += [remark] if remark else []
@@ -421,10 +414,9 @@ def haptic_rendering_of(scene: Scene) -> HapticRendering:
     """
     from us_sim.tracking.haptic import HapticDevice, HapticRendering
 
-    tracker = scene.tracker
     settings = source_settings(scene, "haptic")
     device = HapticDevice(settings, *tracker_poses_of(scene))
-    return HapticRendering(settings, device, time_offset=tracker.time_offset)
+    return HapticRendering(settings, device, time_offset=scene.tracker.time_offset)
 
 
 def _pose_or_file(given: Placement | str | None) -> Pose:
@@ -465,23 +457,30 @@ def colour_of(scene: Scene, name: str) -> Colour:
 
 
 def require_labels(scene: Scene, label_names: Mapping[int, str]) -> None:
-    """Check that the volume has the labels that the scene's structures are made from.
-
-    Args:
-        scene: with structures.
-        label_names: of the volume's labels, by their numbers; none where it has no labels.
+    """Check that the volume has every label that the scene names, beside those of materials.
 
     Raises:
         SceneError: it has not.
     """
+    from us_sim.tissue.model import FACES
+
+    held = enumerate(scene.tissue.fixed if scene.tissue else ())
+    tissues = scene.imaging.acoustics.tissues if scene.imaging.acoustics.is_live else ()
+    named = {
+        f"structures.{name}{'.label' if given.label else ''}": given.label or name
+        for name, given in scene.structures.items()
+        if not given.file
+    }
+    named |= {f"tissue.fixed[{i}]": name for i, name in held if name not in FACES}
+    named |= {f"imaging.acoustics.tissues.{name}": name for name in tissues if name != AROUND}
+    named |= {"episode.target": scene.episode.target} if scene.episode.target else {}
     known = label_names.values()
-    for name, given in scene.structures.items():
-        label = given.label or name
-        if not given.file and label not in known:
-            key = "label: " if given.label else ""
+    for key, label in named.items():
+        if label not in known:
+            faces = f"; faces are {', '.join(FACES)}" if key.startswith("tissue") else ""
             raise SceneError(
-                f"{scene.origin}: structures.{name}: {key}the volume has no label `{label}`; it "
-                f"has {', '.join(known) or 'none'}, or name a surface `file`"
+                f"{scene.origin}: {key}: the volume has no label `{label}`; it has "
+                f"{', '.join(known) or 'none'}{faces}"
             )
 
 

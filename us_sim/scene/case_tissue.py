@@ -114,14 +114,10 @@ def _mesh(case: Case, probe: ProbeSettings, pose: Placement) -> dict[str, Any]:
     thin = cut[1] - cut[0] < _THINNEST
     box = np.where(thin, box, cut)
     return {
-        "lower": _rounded(box[0]),
-        "upper": _rounded(box[1]),
+        "lower": box[0].round(4).tolist(),
+        "upper": box[1].round(4).tolist(),
         "nodes": case.settings.nodes,
     }
-
-
-def _rounded(corner: NDArray[np.float64]) -> list[float]:
-    return [round(float(value), 4) for value in corner]
 
 
 _STEPS = 160

@@ -177,11 +177,7 @@ def check_files(scene: Scene) -> list[str]:
         if case.has_labels:
             case.check_grids()
         checked.append("volume.case (its headers)")
-    label_names = _label_names(scene)
-    if label_names is not None:
-        require_labels(scene, label_names)
-    if scene.tissue is not None:
-        require_materials(scene, scene.tissue.materials, label_names)
+    check_names(scene)
     if scene.tissue is not None and scene.tissue.mesh.file:
         checked.append(f"tissue.mesh.file ({'; '.join(_mesh_remarks(scene.tissue))})")
     surfaces = {f"structures.{name}.file": s.file for name, s in scene.structures.items()}
@@ -206,23 +202,36 @@ def check_files(scene: Scene) -> list[str]:
     if tracker.source.name == "path" and tracker.file:
         path_of(scene, Path(tracker.file))
         checked.append("tracker.file")
-    if scene.exercise:
-        from us_sim.scoring.exercise import read_exercise
-
-        lacking = {*read_exercise(scene.exercise).assigned.structures}
-        lacking -= {*(lacking if label_names is None else label_names.values())}
-        if lacking:
-            raise SceneError(
-                f"{scene.origin}: exercise: {scene.exercise} is with {min(lacking)}, which the "
-                f"volume lacks"
-            )
-        checked.append("exercise")
+    checked += ["exercise"] if scene.exercise else []
     if scene.path:
         from us_sim.recording.path import read_path
 
         read_path(Path(scene.path), option="--topic")
         checked.append("path")
     return checked
+
+
+def check_names(scene: Scene) -> None:
+    """Check that the volume has what the scene and its exercise name, without reading it.
+
+    Raises:
+        UsSimError: it lacks one, or the names cannot be read.
+    """
+    names = _label_names(scene)
+    require_labels(scene, names or {})
+    if scene.tissue is not None:
+        require_materials(scene, scene.tissue.materials, names)
+    if scene.exercise:
+        from us_sim.scoring.exercise import read_exercise
+        from us_sim.scoring.lumen import lumens_of
+
+        vessels = lumens_of(names or {})
+        for name in read_exercise(scene.exercise).assigned.structures:
+            if name not in vessels:
+                raise SceneError(
+                    f"{scene.origin}: exercise: {scene.exercise} is with {name}, which is no "
+                    f"vessel of the volume; it has {', '.join(vessels) or 'none'}"
+                )
 
 
 def _label_names(scene: Scene) -> Mapping[int, str] | None:

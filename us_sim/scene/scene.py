@@ -261,12 +261,13 @@ class Scene(Settings):
 
     def parts(self) -> list[Part]:
         """Every simulation node with the reason why it runs or is left out."""
+        is_felt, felt = self.tracker.source.name == "haptic", ("tissue", "nothing can be felt")
         return [
             Part("probe_tracker", True, f"poses come from `{self.tracker.source.name}`"),
             _part("tissue_deformer", self.tissue, "tissue", "the volume is sliced rigidly"),
             _part("skin_deformer", self.skin, "skin", "no membrane is computed"),
             Part("slice_interpolator", True, self._imaged()),
-            *self._felt(),
+            *([_part("haptic_renderer", self.tissue, *felt)] if is_felt else []),
             *([Part("scorer", True, f"the exercise is {self.exercise}")] if self.exercise else []),
         ]
 
@@ -281,11 +282,6 @@ class Scene(Settings):
         topics = ["probe/pose", "ultrasound/image"]
         topics += ["tissue/nodes"] if self.tissue else []
         return topics + (["skin/nodes"] if self.skin else [])
-
-    def _felt(self) -> list[Part]:
-        if self.tracker.source.name != "haptic":
-            return []
-        return [_part("haptic_renderer", self.tissue, "tissue", "nothing can be felt")]
 
     def _imaged(self) -> str:
         """How images are made, for a person."""
