@@ -35,6 +35,7 @@ LONG = "x" * 300  # more than a file's name may have
         (["demo", "upper_arm", "--volume", "nowhere.mha"], "there is no file"),
         (["run", LONG, "--dry-run"], "there is no scene file xxx"),
         (["bag", "info", LONG], "there is no bag at xxx"),
+        (["view", "compression"], "did you mean exercise:compression?"),
     ],
 )
 def test_bad_input_is_one_sentence(args, words, capsys):

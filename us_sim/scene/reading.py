@@ -283,7 +283,9 @@ def find_scene(name: str | Path) -> Path:
     stem = path.name.removesuffix(".yaml")
     if str(path) in (stem, f"{stem}.yaml") and stem in known:
         return known[stem]
-    like = nearest(stem, known)
+    from us_sim.scoring.exercise import installed_files
+
+    like = f"{EXERCISE_PREFIX}{stem}" if stem in installed_files() else nearest(stem, known)
     hint = f"; did you mean {like}?" if like else ""
     raise SceneError(
         f"there is no scene file {name}; installed scenes are {', '.join(known)}{hint}"

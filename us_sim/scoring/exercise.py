@@ -441,7 +441,7 @@ def read_exercise(name: str | Path) -> Exercise:
     """
     path = Path(os.path.expanduser(name))
     if not path.is_file():
-        known = _installed_files()
+        known = installed_files()
         if str(name) not in known:
             raise ScoreError(f"exercise {unknown(str(name), sorted(known))}")
         path = known[str(name)]
@@ -452,11 +452,12 @@ def read_exercise(name: str | Path) -> Exercise:
 
 def installed_exercises() -> list[Exercise]:
     """Read those in ``config/exercises``: the lesson in its order, then the others by name."""
-    found = [read_exercise(file) for file in _installed_files().values()]
+    found = [read_exercise(file) for file in installed_files().values()]
     return sorted(found, key=lambda each: (each.lesson or len(found) + 1, each.name))
 
 
-def _installed_files() -> dict[str, Path]:
+def installed_files() -> dict[str, Path]:
+    """Return the files in ``config/exercises`` by the names of their exercises."""
     return {
         f.stem: f for root in shared_roots() for f in (root / "config/exercises").glob("*.yaml")
     }
