@@ -36,6 +36,8 @@ LONG = "x" * 300  # more than a file's name may have
         (["run", LONG, "--dry-run"], "there is no scene file xxx"),
         (["bag", "info", LONG], "there is no bag at xxx"),
         (["view", "compression"], "did you mean exercise:compression?"),
+        (["view", "exercise:centre", "--results", f"{__file__}/x"], "/x: cannot be written"),
+        (["view", "exercise:centre", "--results", "no-such://x"], "no-such://x: cannot be written"),
     ],
 )
 def test_bad_input_is_one_sentence(args, words, capsys):

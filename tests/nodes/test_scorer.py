@@ -17,6 +17,7 @@ from us_sim.nodes.messages import image_message, wrench_message
 from us_sim.nodes.scorer import Scorer
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.reading import load_scene
+from us_sim.scoring.result_place import KEPT_FOLDER
 
 KEEP = "name: hold\ntask: {kind: keep_force, force: 5 N, tolerance: 1 N, duration: 8 s}\n"
 VEIN = 6
@@ -151,6 +152,25 @@ def test_the_result_is_written_when_the_attempt_has_ended(bench, small_scene, tm
     page = next(out.glob("*.html")).read_text()
     assert "Passed" in page
     assert "data:image/png" in page
+
+
+def test_a_result_that_cannot_be_written_is_kept_and_tried_again_at_the_end(
+    bench, small_scene, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "hold.yaml").write_text(KEEP)
+    out = tmp_path / "class"
+    out.write_text("no folder")
+    given = {"exercise": str(tmp_path / "hold.yaml"), "results": str(out)}
+    node = bench.make(Scorer, scene=str(small_scene), **given)
+    press(bench, 5.0)
+    bench.spin_until(lambda: KEPT_FOLDER in node.health.warning)
+    kept = list((tmp_path / KEPT_FOLDER).iterdir())
+    assert sorted(file.suffix for file in kept) == [".html", ".json"]
+    out.unlink()
+    node.destroy_node()
+    assert sorted(file.suffix for file in out.iterdir()) == [".html", ".json"]
+    assert not any(file.exists() for file in kept)
 
 
 def press(bench, newtons, seconds=12):

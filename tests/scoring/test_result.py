@@ -15,11 +15,10 @@ from us_sim.scoring.live import Score
 from us_sim.scoring.metrics import Metric
 from us_sim.scoring.result import (
     plain_metrics,
-    read_results,
     result_page,
     state_of,
-    write_result,
 )
+from us_sim.scoring.result_place import KEPT_FOLDER, ResultPlace, read_results
 
 
 def result(student="Ada", begun="2026-11-29T07:07:21+00:00", done=2, **more):
@@ -80,7 +79,7 @@ def test_a_page_has_all_and_no_markup_of_a_name():
 @given(st.text(max_size=30))
 def test_any_name_is_written_and_read_again(tmp_path_factory, student):
     folder = tmp_path_factory.mktemp("class")
-    files = write_result(result(student), b"", str(folder))
+    files = ResultPlace(str(folder)).write(result(student), b"")
     assert [file.rpartition(".")[2] for file in files] == ["html", "json"]
     assert read_results(str(folder)) == [json.loads(json.dumps(result(student)))]
 
@@ -88,8 +87,10 @@ def test_any_name_is_written_and_read_again(tmp_path_factory, student):
 def test_results_go_to_any_address_of_fsspec():
     fsspec = pytest.importorskip("fsspec")
     address = "memory://class/of/1"
-    write_result(result(), b"", address)
-    write_result(result("Bob", "2026-11-29T07:00:00+00:00"), b"", address)
+    place = ResultPlace(address)
+    place.try_out()
+    place.write(result(), b"")
+    place.write(result("Bob", "2026-11-29T07:00:00+00:00"), b"")
     assert [each["about"]["student"] for each in read_results(address)] == ["Bob", "Ada"]
     assert len(fsspec.filesystem("memory").ls("/class/of/1")) == 4
 
@@ -103,10 +104,34 @@ def test_what_is_no_result_is_refused_with_its_name(tmp_path, text):
         read_results(str(tmp_path / "nowhere"))
 
 
-def test_a_place_that_cannot_be_written_is_refused(tmp_path):
+@pytest.mark.parametrize("address", ["file", "nothing-known://class"])
+def test_a_place_that_cannot_be_written_is_found_at_once(tmp_path, monkeypatch, address):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
-    with pytest.raises(ScoreError, match="cannot be written"):
-        write_result(result(), b"", str(tmp_path / "file"))
+    with pytest.raises(ScoreError, match=f"{address}: cannot be written"):
+        ResultPlace(address).try_out()
+
+
+def test_a_place_that_was_tried_out_is_empty(tmp_path):
+    ResultPlace(str(tmp_path / "class")).try_out()
+    assert not any((tmp_path / "class").iterdir())
+
+
+def test_results_that_a_place_refuses_are_kept_until_it_takes_them(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "class").write_text("no folder")
+    place = ResultPlace(str(tmp_path / "class"))
+    for student in ("Ada", "Bob"):
+        with pytest.raises(ScoreError, match=f"cannot be written.*{KEPT_FOLDER}/{student}.*html"):
+            place.write(result(student), b"")
+    with pytest.raises(ScoreError, match=r"cannot be written.*Ada.*html"):
+        place.write_kept()
+    assert len(read_results(KEPT_FOLDER)) == 2
+    (tmp_path / "class").unlink()
+    assert len(place.write_kept()) == 4
+    assert place.write_kept() == []
+    assert len(read_results(str(tmp_path / "class"))) == 2
+    assert not any((tmp_path / KEPT_FOLDER).iterdir())
 
 
 def test_the_table_of_a_class_has_a_row_for_each_attempt(tmp_path):

@@ -54,7 +54,7 @@ def _require_new(out: Path | None, files: Sequence[str]) -> None:
 
 def _score_class(args: argparse.Namespace) -> int:
     from us_sim.scoring.class_table import CLASS_FILES, class_table, write_class
-    from us_sim.scoring.result import read_results
+    from us_sim.scoring.result_place import read_results
 
     _require_new(args.out, CLASS_FILES)
     table = class_table(read_results(args.of_class))

@@ -196,13 +196,17 @@ def _results_address(args: argparse.Namespace) -> str | None:
     """Return where results go, a folder from wherever nodes run.
 
     Raises:
-        UsSimError: there is a student and no place.
+        UsSimError: there is a student and no place, or it cannot be written.
     """
+    from us_sim.scoring.result_place import ResultPlace
+
     if args.results is None:
         if args.student:
             raise UsSimError(f"--student {args.student}: say with --results where results go")
         return None
-    return str(args.results) if "://" in args.results else str(full_path(args.results))
+    address = str(args.results if "://" in args.results else full_path(args.results))
+    ResultPlace(address).try_out()
+    return address
 
 
 _OF_THE_PLAYER = ("rate", "loop", "time")

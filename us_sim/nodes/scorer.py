@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from importlib.metadata import version
 from io import BytesIO
 from typing import Any
@@ -31,7 +32,8 @@ from us_sim.scoring.exercise import IN_AIR, Step, read_exercise
 from us_sim.scoring.live import LiveScan, Score
 from us_sim.scoring.metrics import Scan
 from us_sim.scoring.picture import draw_score
-from us_sim.scoring.result import plain_metrics, state_of, write_result
+from us_sim.scoring.result import plain_metrics, state_of
+from us_sim.scoring.result_place import ResultPlace
 from us_sim.scoring.settings import ScoreSettings
 
 _PERIOD = 200_000_000  # ns of the probe's poses, after which areas are measured again
@@ -72,6 +74,8 @@ class Scorer(SceneNode):
         scanner = scanner_of(self.scene, volume, threads=self.threads)
         self._live = LiveScan(volume, scanner, self._exercise, limits)
         self._title = self._exercise.name if self._exercise is not None else self.scene.name
+        results = self._settings.results
+        self._place = ResultPlace(results) if results else None
         self._void = ""
         if self._settings.begun:
             self._void = "the scorer was started again: begin anew"
@@ -90,7 +94,9 @@ class Scorer(SceneNode):
         self.health.state = "following"
 
     def destroy_node(self) -> None:
-        """Write the result of an attempt that has not ended, too."""
+        """Write what could not be written before, and the attempt that has not ended, too."""
+        if self._place is not None:
+            self._write(self._place.write_kept)
         self._keep_result(self._live.score(), is_last=True)
         super().destroy_node()
 
@@ -145,7 +151,7 @@ class Scorer(SceneNode):
 
     def _tell(self) -> None:
         is_heard = self._score.get_subscription_count() > 0
-        if not is_heard and not self._settings.results:
+        if not is_heard and self._place is None:
             return
         score = self._live.score()
         if score is None:
@@ -215,15 +221,20 @@ class Scorer(SceneNode):
         picture = self._draw_score(scan, score.steps) if scan is not None else b""
         if not is_last:
             self._publish_picture(picture)
-        if self._settings.results:
+        if self._place is not None:
             result = self._result(score)
             result["state"] = "not passed" if result["state"] == "running" else result["state"]
-            try:
-                files = write_result(result, picture, self._settings.results)
-            except ScoreError as error:
-                self.health.problem("results", str(error))
-            else:
-                self.get_logger().info(f"the result is in {files[0]}")
+            self._write(partial(self._place.write, result, picture))
+
+    def _write(self, write: Callable[[], Sequence[str]]) -> None:
+        try:
+            files = write()
+        except ScoreError as error:
+            self.health.warning = str(error)
+            self.get_logger().error(str(error))
+            return
+        if files:
+            self.get_logger().info(f"the result is in {', '.join(files)}")
 
     def _draw_score(self, scan: Scan, steps: Sequence[Step]) -> bytes:
         drawn = BytesIO()

@@ -11,16 +11,12 @@ The document has `name`, `description`, `scene`, `state` (of `STATES`), `seconds
 from __future__ import annotations
 
 import base64
-import json
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from us_sim.errors import ScoreError
 from us_sim.scoring.live import Score
 from us_sim.scoring.metrics import DEFINITIONS, Metric
 from us_sim.scoring.settings import STATES
@@ -88,89 +84,6 @@ def result_page(result: Mapping[str, Any], picture: bytes = b"") -> str:
 def picture_address(picture: bytes) -> str:
     """Return a PNG as an address that holds it."""
     return f"data:image/png;base64,{base64.b64encode(picture).decode()}"
-
-
-def write_result(result: Mapping[str, Any], picture: bytes, address: str) -> list[str]:
-    """Write the document and the page, under a name of who, what and when.
-
-    Args:
-        result: the document.
-        picture: PNG of the score.
-        address: a folder, or one of fsspec.
-
-    Returns:
-        The two files' addresses.
-
-    Raises:
-        ScoreError: they cannot be written.
-    """
-    about = result["about"]
-    words = (about.get("student") or "somebody", result["name"], about["begun"])
-    name = "-".join(re.sub(r"[^\w.]+", "_", each).strip("_") for each in words)
-    page, document = result_page(result, picture), json.dumps(result, indent=2)
-    written = []
-    for suffix, text in ((".html", page), (".json", document)):
-        file = f"{address.rstrip('/')}/{name}{suffix}"
-        try:
-            if "://" in address:
-                with _fsspec().open(file, "w", encoding="utf-8") as opened:
-                    opened.write(text)
-            else:
-                path = Path(file)
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_text(text, encoding="utf-8")
-        except ScoreError:
-            raise
-        except Exception as error:  # what a file system raises is its own
-            raise ScoreError(f"results: {file} cannot be written: {error}") from error
-        written.append(file)
-    return written
-
-
-def read_results(address: str) -> list[dict[str, Any]]:
-    """Return the documents of a folder, or an address of fsspec, by the time of their begin.
-
-    Raises:
-        ScoreError: it cannot be read, or holds none.
-    """
-    try:
-        if "://" in address:
-            files = _fsspec().open_files(f"{address.rstrip('/')}/*.json", "r", encoding="utf-8")
-            texts = []
-            for each in files:
-                with each as opened:
-                    texts.append((each.path, opened.read()))
-        else:
-            found = sorted(Path(address).glob("*.json"))
-            texts = [(str(file), file.read_text(encoding="utf-8")) for file in found]
-    except ScoreError:
-        raise
-    except Exception as error:
-        raise ScoreError(f"--class {address}: cannot be read: {error}") from error
-    results = [_read(name, text) for name, text in texts]
-    if not results:
-        raise ScoreError(f"--class {address}: holds no result of `us-sim view --results`")
-    return sorted(results, key=lambda each: str(each["about"]["begun"]))
-
-
-def _read(name: str, text: str) -> dict[str, Any]:
-    try:
-        result = json.loads(text)
-        missing = {"name", "state", "about", "plain", "steps", "faults"} - set(result)
-        if missing:
-            raise ValueError(f"it has no {', '.join(sorted(missing))}")
-        result["about"]["begun"]
-    except (ValueError, TypeError, KeyError) as error:
-        raise ScoreError(f"{name}: is no result of `us-sim view --results`: {error}") from error
-    return dict(result)
-
-
-def _fsspec() -> Any:
-    try:
-        import fsspec
-    except ImportError as error:
-        raise ScoreError("results: an address needs fsspec: pip install fsspec") from error
-    return fsspec
 
 
 def _definition_of(label: str) -> str:
