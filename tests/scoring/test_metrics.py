@@ -44,12 +44,12 @@ def test_a_round_of_a_circle():
 
 
 def test_a_press_of_a_triangle():
-    """0 for a second, up to 20 N and down again within 4 s, 0 for a second."""
+    """0 for a second, up to 20 N and down again within 4 s, 0.1 N at 1.01 s, 0 for a second."""
     times = np.linspace(0, 6, 6001)
     force = Force(times, np.interp(times, [0, 1, 3, 5, 6], [0, 0, 20, 0, 0]))
-    found = table(Scan(circle(), force), ScoreSettings(force_limit="15 N", contact_force=0.001))
-    assert found["Time in Contact", "Probe"] == pytest.approx(4.0, rel=1e-3)
-    assert found["Mean Probe Force in Contact", "Probe"] == pytest.approx(10.0, rel=1e-3)
+    found = table(Scan(circle(), force), ScoreSettings(force_limit="15 N"))
+    assert found["Time in Contact", "Probe"] == pytest.approx(3.98, rel=1e-3)
+    assert found["Mean Probe Force in Contact", "Probe"] == pytest.approx(10.05, rel=1e-3)
     assert found["Peak Probe Force", "Probe"] == 20.0
     assert found["Time above 15 N", "Probe"] == pytest.approx(1.0, rel=1e-2)
     assert found["Force Impulse", "Probe"] == pytest.approx(40.0, rel=1e-6)

@@ -28,13 +28,13 @@ from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import ScorerSettings
 from us_sim.recording.decoding import nanoseconds_of, pixels_from, pose_from, wrench_from
 from us_sim.scene.building import scanner_of, volume_of
-from us_sim.scoring.exercise import IN_AIR, Step, read_exercise
+from us_sim.scoring.exercise import Step, read_exercise
 from us_sim.scoring.live import LiveScan, Score
 from us_sim.scoring.metrics import Scan
 from us_sim.scoring.picture import draw_score
 from us_sim.scoring.result import plain_metrics, state_of
 from us_sim.scoring.result_place import ResultPlace
-from us_sim.scoring.settings import ScoreSettings
+from us_sim.scoring.settings import CONTACT_FORCE, ScoreSettings
 
 _PERIOD = 200_000_000  # ns of the probe's poses, after which areas are measured again
 OWN = "scorer"
@@ -120,7 +120,7 @@ class Scorer(SceneNode):
         if self._begin:
             time, force = self._seconds(nanoseconds_of(message.header.stamp)), wrench_from(message)
             self._live.add_force(time, force[:3])
-            if "begun" not in self.health.values and np.linalg.norm(force[:3]) >= IN_AIR:
+            if "begun" not in self.health.values and np.linalg.norm(force[:3]) >= CONTACT_FORCE:
                 self.health.values["begun"] = f"{1e-9 * self._begin:.3f}"  # by now it is lost
 
     def _on_labels(self, message: Image) -> None:

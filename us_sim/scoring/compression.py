@@ -15,17 +15,9 @@ from numpy.typing import NDArray
 
 from us_sim.errors import ScoreError
 from us_sim.scoring.centre_line import CentreLine
-from us_sim.scoring.exercise import (
-    IN_AIR,
-    LENGTH,
-    PART,
-    Attempt,
-    Fault,
-    Step,
-    Task,
-)
+from us_sim.scoring.exercise import LENGTH, PART, Attempt, Fault, Step, Task
 from us_sim.scoring.metrics import Scan
-from us_sim.scoring.settings import ANSWERS, NO_ANSWER, NO_THROMBUS
+from us_sim.scoring.settings import ANSWERS, CONTACT_FORCE, NO_ANSWER, NO_THROMBUS
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.slicing.settings import WALLS_TOUCH
@@ -127,7 +119,7 @@ class _Look(NamedTuple):
 
     @property
     def touches(self) -> bool:
-        return not self.force < IN_AIR
+        return not self.force < CONTACT_FORCE
 
     def presses(self, is_open: float) -> bool:
         """Return whether the vein is pressed, by its area or by the force."""

@@ -23,6 +23,7 @@ from us_sim.errors import ScoreError
 from us_sim.geometry.pose import Placement, Pose
 from us_sim.scoring.centre_line import CentreLine
 from us_sim.scoring.metrics import Scan, Section
+from us_sim.scoring.settings import CONTACT_FORCE
 from us_sim.settings.choice import Chosen
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
@@ -34,8 +35,6 @@ from us_sim.share import shared_roots
 
 LENGTH, PART = Quantity("length", 1e-4, 1.0), Quantity("number", 0.0, 1.0)
 _TIME, _FORCE = Quantity("time", 0.1, 3600.0), "force"
-IN_AIR = 0.1
-"""N, below which the probe touches nothing."""
 _MM = 1e3
 
 
@@ -89,7 +88,7 @@ class Attempt(ABC):
         """Take the samples that are new, from the first in the air on."""
         times, is_touching = scan.motion.times, np.ones(len(scan.motion), bool)
         if scan.force is not None:
-            times, is_touching = scan.force.times, scan.force.newtons >= IN_AIR
+            times, is_touching = scan.force.times, scan.force.newtons >= CONTACT_FORCE
             in_air = times[(times > scan.since) & ~is_touching]
             if not self.was_in_air:
                 if not len(in_air):

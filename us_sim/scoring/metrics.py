@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from us_sim.errors import ScoreError
 from us_sim.scoring.centre_line import CentreLine
 from us_sim.scoring.motion import ACTION_SPEED, ACTION_TURN, Actions, Motion
-from us_sim.scoring.settings import ScoreSettings
+from us_sim.scoring.settings import CONTACT_FORCE, ScoreSettings
 
 _Array = NDArray[np.float64]
 _MM, _MM2, _DEGREES = 1e3, 1e6, float(np.rad2deg(1.0))
@@ -237,13 +237,13 @@ class Tally:
             0.5 * (force.newtons[1:] + force.newtons[:-1]),
             force.newtons[1:],
         )
-        touching = ends >= self._settings.contact_force
+        touching = ends >= CONTACT_FORCE
         self._sum(contact=steps[touching].sum(), pressed=during[touching] @ steps[touching])
         self._sum(above=steps[ends > self._settings.force_limit].sum(), impulse=during @ steps)
         self._peak("force", force.newtons)
         if scan.width is not None:
             motion = scan.motion
-            at_poses = force.at(motion.times) >= self._settings.contact_force
+            at_poses = force.at(motion.times) >= CONTACT_FORCE
             old = len(motion) - np.count_nonzero(motion.times > scan.since)
             at_poses[:old] = False
             if old:

@@ -9,6 +9,8 @@ from us_sim.errors import ScoreError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
+CONTACT_FORCE = 0.1
+"""N, from which the probe touches the skin; a sensor's noise is below it."""
 STATES = {
     "to lift": "lift the probe off the skin to begin",
     "to do": "begins when the probe touches the skin",
@@ -28,15 +30,10 @@ NO_THROMBUS = "none"
 
 @dataclass(frozen=True)
 class ScoreSettings(Settings):
-    """Limits that metrics of force are about."""
+    """The limit that metrics of force are about."""
 
     error: ClassVar = ScoreError
 
     force_limit: float = setting(
         Quantity("force", 0.01, 1000.0), "of which the time above it is told", default=10.0
-    )
-    contact_force: float = setting(
-        Quantity("force", 1e-6, 100.0),
-        "from which the probe is in contact; a sensor's noise is below it",
-        default=0.1,
     )
