@@ -61,9 +61,7 @@ class ContactModel:
         return self._split[0]
 
     @cached_property
-    def _split(
-        self,
-    ) -> tuple[Array, float, Array, Array, Array]:
+    def _split(self) -> tuple[Array, float, Array, Array, Array]:
         """The push's direction (3,), N, and how it falls (6,); the rest's wrench (6,) and stiffness
         (6, 6)."""
         force = float(np.linalg.norm(self.wrench[:3]))

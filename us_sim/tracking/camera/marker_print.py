@@ -124,9 +124,7 @@ def _is_flat(body: RigidBody) -> bool:
     return bool(np.abs(offsets).max() <= _FLAT and (body.normals @ body.normals[0]).min() >= 0.999)
 
 
-def _piece(
-    body: RigidBody,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _piece(body: RigidBody) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Lay out a flat body: its markers' corners (M, 4, 2), black cells (b, 4, 2), size (2,), mm.
 
     From its upper left corner, x right and y down as one sees it, with the white about it.
