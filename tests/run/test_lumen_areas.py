@@ -66,7 +66,7 @@ def test_tissue_pressed_to_half_its_height_halves_the_area_wherever_it_is_cut(mo
     half = BLOCK.nodes * [1.0, 1.0, 0.5]
     areas = measured(monkeypatch, [Pose([0, 0, 0]), *poses], [BLOCK.nodes, half, half, half])
     np.testing.assert_allclose(areas.fraction("vein"), [1.0, 0.5, 0.5, 0.5], atol=0.03)
-    assert areas.change("vein", 2) == pytest.approx(-0.5, abs=0.03)
+    assert areas.fraction("vein")[2] == pytest.approx(0.5, abs=0.03)
 
 
 def test_a_plane_that_hardly_cuts_the_vessel_is_compared_with_nothing(monkeypatch):

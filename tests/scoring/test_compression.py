@@ -84,7 +84,7 @@ def test_a_vein_that_is_closed_at_every_point_is_examined():
     made = attempt(scanned(examination()))
     assert [step.is_done for step in made.steps()] == [True] * 3
     assert np.allclose([step.target[0] for step in made.steps()], LINE.points[[10, 30, 50]])
-    assert not made.faults()
+    assert not made.faults
     assert made.seconds() == pytest.approx(15.0, abs=1.2)  # from the first touch
 
 
@@ -137,10 +137,10 @@ def test_sliding_and_too_much_force_are_said_at_once_and_stand_in_the_result():
     keys = bad("too hard, and sliding while pressed")
     words = ["over 20 N", "slid"]
     made = attempt(scanned(keys))
-    assert len(made.faults()) == 2
-    assert all(word in fault.what for word, fault in zip(words, made.faults(), strict=True))
+    assert len(made.faults) == 2
+    assert all(word in fault.what for word, fault in zip(words, made.faults, strict=True))
     early = attempt(scanned(keys[:6]))  # while the force is there
-    assert "over 20 N" in early.faults()[0].what
+    assert "over 20 N" in early.faults[0].what
     assert "over 20 N" in early.steps()[0].seen
 
 
@@ -148,7 +148,7 @@ def test_a_bad_press_can_be_made_good():
     keys = [*examination(newtons=(9.0, 25.0, 9.0)), *press(POINTS[1]), (1, POINTS[1], 0.5)]
     made = attempt(scanned(keys))
     assert [step.is_done for step in made.steps()] == [True] * 3
-    assert len(made.faults()) == 1
+    assert len(made.faults) == 1
 
 
 def test_a_point_is_done_when_the_vein_is_open_again():
@@ -219,7 +219,7 @@ def test_in_pieces_it_is_the_same_as_at_once(cut):
     parts.add(until(seen, cut))
     parts.add(replace(seen, since=cut))
     assert [step[:3] for step in parts.steps()] == [step[:3] for step in whole.steps()]
-    assert parts.faults() == whole.faults()
+    assert parts.faults == whole.faults
     assert parts.seconds() == whole.seconds()
 
 

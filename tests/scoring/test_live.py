@@ -92,7 +92,7 @@ def test_the_score_so_far_is_that_of_all_samples_so_far(name):
         whole = scan.scan()
         attempt = exercise.begin(whole.lines)
         attempt.add(whole)
-        assert (faults, seconds) == (attempt.faults(), attempt.seconds())
+        assert (faults, seconds) == (attempt.faults, attempt.seconds())
         expected = list(metrics_of(whole))
         assert [each.label for each in metrics] == [each.label for each in expected]
         for found, known in zip(metrics, expected, strict=True):

@@ -11,7 +11,7 @@ import pandas as pd
 from us_sim.command.options import add_setting_options, read_settings
 from us_sim.errors import ScoreError
 from us_sim.progress import late_progress
-from us_sim.scoring.exercise import Exercise, Step, read_exercise, result_of
+from us_sim.scoring.exercise import Exercise, Step, read_exercise
 from us_sim.scoring.metrics import metrics_of
 from us_sim.scoring.picture import draw_score
 from us_sim.scoring.settings import ScoreSettings
@@ -111,4 +111,6 @@ def _exercise_table(exercise: Exercise, steps: Sequence[Step]) -> str:
 
     rows = [(each.what, "yes" if each.is_done else "no", each.seen) for each in steps]
     table = markdown_table((exercise.name, "done", "seen"), rows)
-    return f"{table}\n\n{result_of([each.is_done for each in steps])}"
+    done = sum(each.is_done for each in steps)
+    result = "passed" if done == len(steps) else "not passed"
+    return f"{table}\n\n{result}: {done} of {len(steps)} done"

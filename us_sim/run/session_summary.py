@@ -151,7 +151,7 @@ def _summary_of(areas: LumenAreas) -> dict[str, Any]:
         result[f"{name}_at_rest_mm2"] = [None if np.isnan(x) else float(x) for x in at_rest]
         moments = {"at_full_press": areas.pressed, "after_release": len(areas.time) - 1}
         for moment, sample in moments.items():
-            change = areas.change(name, sample)
+            change = float(areas.fraction(name)[sample] - 1.0)
             result[f"{name}_change_{moment}"] = None if np.isnan(change) else change
     return result
 

@@ -134,9 +134,8 @@ class _Point:
     place: NDArray[np.float64]  # (3,) m, the same in frame ``patient``
     is_done: bool = False
     seen: str = "not reached"
-    is_tried: bool = False
     is_examined: bool = False  # by a press that counts, whatever it showed
-    most: float | None = None  # N, of the last press
+    most: float | None = None  # N, of the last press; None where there was none
     answer: str = ""  # of `ANSWERS`
 
 
@@ -185,7 +184,7 @@ class _Examination(Attempt):
         self._looked = -np.inf  # s, likewise
         self._is_over = False  # whether the force is over its limit
         self._thrombus = np.inf, -np.inf  # m, from and to
-        self._faults: list[Fault] = []
+        self.faults: list[Fault] = []
         self._answer = ""  # where the thrombus is: a point's number, or that there is none
 
     def answer(self, points: Sequence[str], thrombus: str, time: float) -> None:
@@ -227,17 +226,9 @@ class _Examination(Attempt):
                 times = scan.force.times
                 between = scan.force.newtons[(times > self._looked) & (times <= time)]
                 peak = float(between.max(initial=np.nan_to_num(peak)))
-            open_artery = float(artery.fraction[k]) if artery is not None else np.nan
-            self._look(
-                _Look(
-                    time,
-                    float(section.along[k]),
-                    float(section.fraction[k]),
-                    float(force[k]),
-                    peak,
-                    open_artery if np.isfinite(open_artery) else 1.0,
-                )
-            )
+            part_of_artery = 1.0 if artery is None else np.nan_to_num(artery.fraction[k], nan=1.0)
+            along, part = float(section.along[k]), float(section.fraction[k])
+            self._look(_Look(time, along, part, float(force[k]), peak, float(part_of_artery)))
             self._looked = time
 
     def steps(self) -> list[Step]:
@@ -251,7 +242,7 @@ class _Examination(Attempt):
                 continue
             seen = self._tell_press() if point is pressed and not point.is_done else point.seen
             is_here = abs(self._along - point.at) <= self._task.tolerance
-            is_missed = point.is_tried and not point.is_done and not is_here
+            is_missed = point.most is not None and not (point.is_done or is_here)
             steps.append(Step(what, point.is_done, seen, point.place[None], is_missed=is_missed))
         if self.is_blind:
             steps.append(self._thrombus_step())
@@ -289,10 +280,6 @@ class _Examination(Attempt):
         if abs(inside) <= _EDGE:
             return not_compressible, compressible
         return (not_compressible,) if inside > 0 else (compressible,)
-
-    def faults(self) -> list[Fault]:
-        """Return what was done wrong."""
-        return self._faults
 
     def _steps_of_time(self) -> list[Step]:
         limit = self._task.time_limit
@@ -348,7 +335,7 @@ class _Examination(Attempt):
         if look.touches and slid > self._task.tolerance and not press.has_slid:
             press.has_slid = True
             press.problem = f"slid {_MM * slid:.0f} mm under pressure: let go before you slide on"
-            self._faults.append(Fault(look.time, press.problem))
+            self.faults.append(Fault(look.time, press.problem))
 
     def _check_force(self, look: _Look) -> None:
         limit = self._task.force_limit
@@ -357,7 +344,7 @@ class _Examination(Attempt):
             return
         problem = f"{look.peak:.1f} N, over {limit:g} N: press less"
         if not was_over:
-            self._faults.append(Fault(look.time, problem))
+            self.faults.append(Fault(look.time, problem))
         if self._press is not None and not self._press.problem:
             self._press.problem = problem
 
@@ -375,7 +362,7 @@ class _Examination(Attempt):
         self._press, self._was_lifted = None, False
         if point is None or point.is_done:
             return
-        point.is_tried, point.most = True, press.most
+        point.most = press.most
         is_seen = press.closed is not None or press.most >= self._task.enough
         point.is_examined |= is_seen and not press.problem
         point.is_done, point.seen = self._judge(press, point)

@@ -82,6 +82,8 @@ class Attempt(ABC):
     """s since the first pose, when the probe touched the skin for the first time."""
     ended: float | None = None
     """s, when all was done or the time was over; None before."""
+    faults: Sequence[Fault] = ()
+    """What was done wrong, in order."""
     _time = 0.0  # s, of the last pose
 
     def add(self, scan: Scan) -> None:
@@ -107,10 +109,6 @@ class Attempt(ABC):
     @abstractmethod
     def steps(self) -> list[Step]:
         """Return every thing that is to be done."""
-
-    def faults(self) -> list[Fault]:
-        """Return what was done wrong, in order."""
-        return []
 
     def answer(self, points: Sequence[str], thrombus: str, time: float) -> None:  # noqa: ARG002
         """Take the learner's answers so far.
@@ -150,33 +148,28 @@ class Task(Settings):
         """An attempt at it, in a scene with these vessels."""
 
 
-class _Hold:
-    """How long (s) something was held without a break.
-
-    Args:
-        duration: that is wanted.
-    """
+class _Holding(Attempt):
+    """An attempt to hold something without a break; it ends when that was done long enough."""
 
     def __init__(self, duration: float) -> None:
-        self.longest = self.held = 0.0
-        self.reached: float | None = None  # s, when it had been held for the duration
-        self._duration = duration
+        self._duration = duration  # s
+        self._longest = self._held = 0.0  # s
         self._last, self._was = 0.0, False
 
-    def add(self, times: NDArray[np.float64], within: NDArray[np.bool_]) -> None:
+    def _hold(self, times: NDArray[np.float64], within: NDArray[np.bool_]) -> None:
         for time, now in zip(times.tolist(), within.tolist(), strict=True):
-            self.held = self.held + time - self._last if now and self._was else 0.0
-            self.longest = max(self.longest, self.held)
-            if self.reached is None and self.longest >= self._duration:
-                self.reached = time
+            self._held = self._held + time - self._last if now and self._was else 0.0
+            self._longest = max(self._longest, self._held)
+            if self.ended is None and self._longest >= self._duration:
+                self.ended = time
             self._last, self._was = time, now
 
-    def step(self, what: str) -> Step:
+    def _step(self, what: str) -> Step:
         """Return the step, with how long it is held now and was at most."""
-        seen = f"held for {self.longest:.1f} s"
-        if self.reached is None and self.held < self.longest:
-            seen = f"held for {self.held:.1f} s, {self.longest:.1f} s at most"
-        return Step(what, self.reached is not None, seen)
+        seen = f"held for {self._longest:.1f} s"
+        if self.ended is None and self._held < self._longest:
+            seen = f"held for {self._held:.1f} s, {self._longest:.1f} s at most"
+        return Step(what, self.ended is not None, seen)
 
 
 @dataclass(frozen=True)
@@ -192,24 +185,25 @@ class KeepForce(Task):
         return _KeptForce(self)
 
 
-class _KeptForce(Attempt):
+class _KeptForce(_Holding):
     def __init__(self, task: KeepForce) -> None:
-        self._task, self._hold = task, _Hold(task.duration)
+        super().__init__(task.duration)
+        self._task = task
         self._newtons: float | None = None  # the last
 
     def take(self, scan: Scan) -> None:
         if scan.force is not None:
             new = scan.force.times > scan.since
             within = np.abs(scan.force.newtons - self._task.force) <= self._task.tolerance
-            self._hold.add(scan.force.times[new], within[new])
-            self._newtons, self.ended = float(scan.force.newtons[-1]), self._hold.reached
+            self._hold(scan.force.times[new], within[new])
+            self._newtons = float(scan.force.newtons[-1])
 
     def steps(self) -> list[Step]:
         task = self._task
         what = f"{task.force:g} ± {task.tolerance:g} N for {task.duration:g} s"
         if self._newtons is None:
             return [Step(what, False, "the recording has no force")]
-        step = self._hold.step(what)
+        step = self._step(what)
         now = "" if step.is_done else f"{self._newtons:.1f} N now; "
         return [step._replace(seen=now + step.seen)]
 
@@ -232,10 +226,10 @@ class Centre(Task):
         return _Centred(self, lines[self.structure])
 
 
-class _Centred(Attempt):
+class _Centred(_Holding):
     def __init__(self, task: Centre, line: CentreLine) -> None:
+        super().__init__(task.duration)
         self._task, self._line, self._is_seen = task, line, False
-        self._hold = _Hold(task.duration)
 
     def take(self, scan: Scan) -> None:
         section = scan.sections.get(self._task.structure)
@@ -243,15 +237,14 @@ class _Centred(Attempt):
             new = section.times > scan.since
             self._is_seen |= bool(np.isfinite(section.fraction[new]).any())
             within = _is_centred(section, self._task.offset)
-            self._hold.add(section.times[new], within[new])
-            self.ended = self._hold.reached
+            self._hold(section.times[new], within[new])
 
     def steps(self) -> list[Step]:
         task, points = self._task, self._line.points
         what = f"{task.structure} within {_MM * task.offset:g} mm for {task.duration:g} s"
         if not self._is_seen:
             return [Step(what, False, "never in the image", points)]
-        return [self._hold.step(what)._replace(target=points)]
+        return [self._step(what)._replace(target=points)]
 
 
 @dataclass(frozen=True)
@@ -329,9 +322,10 @@ class View(Task):
         return _Found(self)
 
 
-class _Found(Attempt):
+class _Found(_Holding):
     def __init__(self, task: View) -> None:
-        self._task, self._hold = task, _Hold(task.duration)
+        super().__init__(task.duration)
+        self._task = task
         self._nearest = np.inf, np.inf, np.inf  # how far in all, m, rad
 
     def take(self, scan: Scan) -> None:
@@ -351,8 +345,7 @@ class _Found(Attempt):
                 continue
             last = np.searchsorted(section.times, times, side="right") - 1  # image
             within &= (last >= 0) & (section.area[last] > 0)
-        self._hold.add(times, within)
-        self.ended = self._hold.reached
+        self._hold(times, within)
         best = int(np.argmin(apart / task.distance + turned / task.angle))
         far = apart[best] / task.distance + turned[best] / task.angle
         self._nearest = min(self._nearest, (far, apart[best], turned[best]))
@@ -360,7 +353,7 @@ class _Found(Attempt):
     def steps(self) -> list[Step]:
         task = self._task
         what = f"the view within {_MM * task.distance:g} mm and {np.rad2deg(task.angle):.0f}°"
-        held = self._hold.step(f"{what} for {task.duration:g} s")
+        held = self._step(f"{what} for {task.duration:g} s")
         _, apart, turned = self._nearest
         if np.isfinite(apart):
             near = f"nearest {_MM * apart:.1f} mm and {np.rad2deg(turned):.0f}°"
@@ -460,15 +453,6 @@ def installed_files() -> dict[str, Path]:
     return {
         f.stem: f for root in shared_roots() for f in (root / "config/exercises").glob("*.yaml")
     }
-
-
-def result_of(done: Sequence[bool]) -> str:
-    """The result of steps in words.
-
-    >>> result_of([True, False])
-    'not passed: 1 of 2 done'
-    """
-    return f"{'passed' if all(done) else 'not passed'}: {sum(done)} of {len(done)} done"
 
 
 def _is_centred(section: Section, offset: float) -> NDArray[np.bool_]:

@@ -143,9 +143,9 @@ class LiveScan:
         metrics = list(tally.metrics())
         if attempt is None:
             return Score(metrics)
-        steps, faults = attempt.steps(), attempt.faults()
-        has_ended = attempt.ended is not None
-        return Score(metrics, steps, faults, attempt.seconds(), has_ended, attempt.was_in_air)
+        seconds, has_ended = attempt.seconds(), attempt.ended is not None
+        was_in_air = attempt.was_in_air
+        return Score(metrics, attempt.steps(), attempt.faults, seconds, has_ended, was_in_air)
 
     def _settle(self) -> None:
         """Add what later samples cannot change any more."""

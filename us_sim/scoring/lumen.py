@@ -21,8 +21,6 @@ VESSELS = ("vein", "artery")  # kinds of tissue whose cross-sections are measure
 _HARDLY_CUT = 0.1
 """Of a vessel's mean cross-section, or else of its largest in an image at rest: less of it is its
 edge, or cut off by the image."""
-
-
 _STEEPEST = 0.2
 """Cosine of a probe's tilt; beyond it, how far it would have to be lifted means nothing."""
 
@@ -88,10 +86,6 @@ class LumenAreas:
         """(K,) area over that of the same plane at rest; NaN where there is nothing to compare."""
         return np.asarray(self.area[vessel] / self.at_rest[vessel])
 
-    def change(self, vessel: str, sample: int) -> float:
-        """Relative change of the area from rest; -0.5 is half closed."""
-        return float(self.fraction(vessel)[sample] - 1.0)
-
 
 class LumenMeter:
     """Measures vessels image by image.
@@ -121,7 +115,7 @@ class LumenMeter:
         self._typical = np.array(typical).reshape(-1, 1)  # m²
         self._pixel = float(np.prod(scanner.probe.pixel_spacing))
         self._edge = _edge(scanner.probe)
-        self._time: list[float] = []
+        self.times: list[float] = []  # s, of all samples
         self._depth: list[float] = []
         self._cuts: dict[str, list[tuple[float, ...]]] = {name: [] for name in self._lines}
         self._found: list[list[list[float]]] = []  # m², now and at rest, by vessel
@@ -132,7 +126,7 @@ class LumenMeter:
         above = lifted(pose)
         seen = labels, self._scanner.labels(above, self._rest)
         inside = [[np.isin(each, n) for n in self._lumens.values()] for each in seen]
-        self._time.append(time)
+        self.times.append(time)
         self._depth.append(float(pose.position[2]))
         for name, line in self._lines.items():
             cut = line.cut(above, self._scanner.probe.width)
@@ -143,14 +137,14 @@ class LumenMeter:
 
     def areas(self) -> LumenAreas | None:
         """All that were measured; None where no vessel was cut that can be compared."""
-        if not self._time:
+        if not self.times:
             return None
         now, rest = self._compared()
         cut = {n: i for i, n in enumerate(self._lumens) if np.isfinite(rest[i]).any()}
         if not cut:
             return None
         return LumenAreas(
-            time=np.array(self._time),
+            time=np.array(self.times),
             depth=np.array(self._depth),
             area={name: now[i] for name, i in cut.items()},
             at_rest={name: rest[i] for name, i in cut.items()},
@@ -169,11 +163,6 @@ class LumenMeter:
         typical = np.where(self._typical > 0, self._typical, rest.max(axis=1, keepdims=True))
         return now, np.where((rest <= _HARDLY_CUT * typical) | ~whole, np.nan, rest)
 
-    @property
-    def times(self) -> list[float]:
-        """Of all samples, s."""
-        return self._time
-
     def is_settled(self, sample: int) -> bool:
         """Whether later samples change nothing of this one and those before."""
         now, rest = self._found[sample]
@@ -181,7 +170,7 @@ class LumenMeter:
 
     def sections(self, begin: int = 0, end: int | None = None) -> dict[str, Section]:
         """Areas and places of the vessels that have a centre line, of these samples."""
-        times = np.array(self._time[begin:end])
+        times = np.array(self.times[begin:end])
         if not len(times):
             return {}
         areas = dict(zip(self._lumens, zip(*self._compared(begin, end), strict=True), strict=True))

@@ -21,8 +21,6 @@ from us_sim.scoring.settings import CONTACT_FORCE, ScoreSettings
 
 _Array = NDArray[np.float64]
 _MM, _MM2, _DEGREES = 1e3, 1e6, float(np.rad2deg(1.0))
-
-
 DEFINITIONS = {
     "Elapsed Time": "from the first pose to the last",
     "Path Length": "sum of the steps between poses",

@@ -10,10 +10,8 @@ A step is the way from one sample to the next. It counts as being where its end 
 
 >>> from us_sim.scoring.motion import Motion
 >>> motion = Motion([0.0, 1.0, 2.0], [[0, 0, 0], [3, 0, 0], [3, 4, 0]], [[0, 0, 0, 1]] * 3)
->>> float(motion.elapsed_time()), float(motion.path_length())
-(2.0, 7.0)
->>> float(motion.path_length([False, False, True]))
-4.0
+>>> motion.steps.tolist(), motion.speeds.tolist()
+([1.0, 1.0], [3.0, 4.0])
 """
 
 from __future__ import annotations
@@ -93,14 +91,6 @@ class Motion:
         """(K-2, 3) m/s², by backward differences."""
         return np.diff(self.velocities, axis=0) / self.steps[1:, None]
 
-    def elapsed_time(self, where: ArrayLike | None = None) -> float:
-        """Seconds, of all steps or of those whose last sample (K,) is true."""
-        return float(self.steps[_ends(where)].sum())
-
-    def path_length(self, where: ArrayLike | None = None) -> float:
-        """Metres, likewise."""
-        return float((self.speeds * self.steps)[_ends(where)].sum())
-
     @cached_property
     def squared_jerks(self) -> _Array:
         """(K-3,) m²/s⁵, squared jerk of each step times its length, by backward differences."""
@@ -134,10 +124,6 @@ class Motion:
         half = 0.5 * width * rotation.apply([1.0, 0.0, 0.0])
         side = Motion(self.times, self.positions - half, self.orientations)
         return side.swept_area(self.positions + half, where, rotation.apply([0.0, 0.0, 1.0]))
-
-
-def _ends(where: ArrayLike | None) -> NDArray[np.bool_] | slice:
-    return slice(None) if where is None else np.asarray(where, bool)[1:]
 
 
 class Actions:
