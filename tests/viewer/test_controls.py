@@ -88,6 +88,16 @@ def test_sliders_cover_what_a_person_would_turn_through(low, high, value, is_who
     assert (span.low, span.high, span.step, span.is_logarithmic) == pytest.approx(covered)
 
 
+@pytest.mark.parametrize(
+    ("value", "high"), [(None, 30.0), (8.0, 30.0), (30.0, 100.0), (64.0, 200.0), (500.0, 750.0)]
+)
+def test_blood_pressure_is_turned_in_whole_mmhg(value, high):
+    span = slider_span(0.0750063, 750.0, value, unit="mmHg")
+    assert not span.is_logarithmic
+    assert (span.low, span.high) == (0.0750063, high)
+    assert span.step == (1.0 if high < 600.0 else 2.0)
+
+
 def test_there_is_no_slider_without_a_range():
     assert slider_span(0.0, float("inf"), 1.0) is None
     assert slider_span(3.0, 3.0, 3.0) is None

@@ -74,6 +74,8 @@ _WIDE = 1000.0  # likewise: beyond, a slider covers what is near the present val
 _AROUND = 100.0  # times the present value, and a hundredth of it, where a slider goes by factors
 _ROOM = 4.0  # times the present value, where a slider begins at zero
 _STEPS = 600
+_FROM_ZERO = {"mmHg": 30.0}
+"""By units that people set in whole numbers: how far a slider reaches at least."""
 _NOTHING = 1e-12  # of the range: a smaller value is zero on a slider
 
 
@@ -92,7 +94,7 @@ class SliderSpan:
 
 
 def slider_span(
-    low: float, high: float, value: float | None, is_whole: bool = False
+    low: float, high: float, value: float | None, is_whole: bool = False, unit: str = ""
 ) -> SliderSpan | None:
     """The span of a slider around a value; None where no slider makes sense.
 
@@ -100,9 +102,15 @@ def slider_span(
         low, high: the range, in the unit that is shown.
         value: at present; None is nothing.
         is_whole: only whole numbers will do.
+        unit: of all these.
     """
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         return None
+    if unit in _FROM_ZERO:
+        from_here = max(low, value or 0.0)
+        reach = _FROM_ZERO[unit]
+        high = min(high, reach if from_here < reach else _round_number(2.0 * from_here))
+        return SliderSpan(low, high, max(1.0, _round_number((high - low) / _STEPS)), False)
     if low > 0.0 and high / low > _BY_FACTORS and not is_whole:
         if value and value > 0.0 and high / low > _WIDE:
             low, high = max(low, value / _AROUND), min(high, value * _AROUND)
@@ -209,7 +217,8 @@ class ParameterControl(Element, component="parameter_control.js"):
             (value == span.low != low) or (value == span.high != high)
         )
         if span is None or not span.holds(value) or is_at_the_end:
-            self._span = slider_span(low, high, value, self.parameter.kind is Kind.WHOLE)
+            is_whole = self.parameter.kind is Kind.WHOLE
+            self._span = slider_span(low, high, value, is_whole, self.parameter.unit)
 
 
 def tip_of(parameter: Parameter) -> str:
