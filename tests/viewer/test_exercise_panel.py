@@ -92,7 +92,7 @@ def test_a_blind_exercise_hides_the_truth_and_asks(page, simulator):
     until(lambda: scorer.picture.is_watched, "the panel is seen")
     scorer.say(steps, feedback="afterwards")
     page.get_by_role("button", name="point 1: not compressible").click()
-    page.get_by_role("button", name="thrombus: 1", exact=True).click()
+    page.get_by_role("button", name="thrombus: at 1", exact=True).click()
     until(lambda: len(asked) == 2, "it is answered")
     assert asked == [("answers", ["not compressible"]), ("thrombus", "1")]
     page.get_by_role("tab", name="Tissue").wait_for(state="hidden")

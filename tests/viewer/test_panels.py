@@ -10,7 +10,7 @@ from fake_nodes import FakeNodes
 
 from us_sim.viewer.parameters import Kind, Parameter
 from us_sim.viewer.status import Level, NodeStatus
-from us_sim.viewer.stream import Simulator
+from us_sim.viewer.stream import ONLY_WATCHES, Simulator
 
 NODE = "slice_interpolator"
 
@@ -77,6 +77,32 @@ def field(page: Any, name: str) -> Any:
 
 def shows(page: Any, name: str, text: str) -> None:
     until(lambda: field(page, name).input_value() == text, f"{name} shows {text}")
+
+
+def test_who_only_watches_sets_nothing(page: Any, node: Node) -> None:
+    page.goto(f"{page.address}?watch")
+    page.get_by_role("button", name="Panels").click()
+    page.get_by_role("tab", name="Image").click()
+    shows(page, "depth", "40")
+    assert field(page, "depth").is_disabled()
+    assert control(page, "depth").get_attribute("title") == ONLY_WATCHES
+    assert control(page, "contact").locator("[role=switch]").get_attribute("aria-disabled")
+    assert page.locator(".us-level").is_disabled()
+    assert page.get_by_role("button", name="Strain", exact=True).is_disabled()
+    page.get_by_role("button", name="Outlines").click()  # as it is set already
+    page.locator("[aria-pressed=true]", has_text="Outlines").wait_for()
+    number = int(control(page, "depth").get_attribute("id").removeprefix("c"))
+    page.evaluate("number => getElement(number).set(50)", number)
+    page.get_by_text(ONLY_WATCHES).wait_for()
+    assert node.sent == []
+
+
+def test_the_options_of_a_choice_are_a_group_in_a_part_of_the_page(page: Any, node: Node) -> None:
+    opened(page, "Image")
+    control(page, "overlay").locator(".q-select").click()
+    choices = page.get_by_role("region", name="Choices")
+    choices.get_by_role("listbox").get_by_role("group").get_by_role("option", name="strain").click()
+    until(lambda: node.values("overlay") == ["strain"], "it is set")
 
 
 def test_a_number_is_set_in_its_unit(page: Any, node: Node) -> None:

@@ -8,7 +8,7 @@ from awaiting import until
 
 from us_sim.scene.listing import ListedScene
 from us_sim.viewer.session import SessionBoard, SessionState
-from us_sim.viewer.stream import Feed, Packet
+from us_sim.viewer.stream import ONLY_WATCHES, Feed, Packet
 
 RUNNING = SessionState(True, "running", "upper_arm", "/arm.yaml")
 
@@ -44,6 +44,7 @@ def test_a_case_is_loaded_and_a_recording_is_not_ended_unasked(page, session):
         ListedScene("sweep", "/sweep.yaml", problem="volume.file: is missing"),
     )
     opened(page, "Cases")
+    page.get_by_role("button", name="Load again upper_arm").wait_for()  # what is read there
     page.get_by_role("button", name="Load liver").click()
     assert not page.get_by_text("sweep").count()  # it cannot be loaded
     until(lambda: asked == [{"scene": "case:/liver"}], "it is asked for", 30.0)
@@ -61,6 +62,27 @@ def test_a_case_is_loaded_and_a_recording_is_not_ended_unasked(page, session):
     page.get_by_role("button", name="Load liver").click()
     page.get_by_role("dialog").get_by_role("button", name="Load").click()
     until(lambda: len(asked) == 2, "it is asked for once more", 30.0)
+
+
+def test_who_only_watches_loads_and_records_nothing(page, session):
+    board, asked = session
+    board.scenes = (ListedScene("liver", "case:/liver", "case"),)
+    page.goto(f"{page.address}?watch")
+    page.locator("#us-panels").click()
+    page.get_by_role("tab", name="Cases").click()
+    load = page.get_by_role("button", name="Load liver")
+    load.wait_for()
+    assert load.is_disabled()
+    assert load.get_attribute("title") == ONLY_WATCHES
+    page.get_by_role("tab", name="Session").click()
+    for name in ("Record", "Stop", "Play or pause", "End replay"):
+        button = page.get_by_role("button", name=name, exact=True)
+        button.wait_for()
+        assert button.is_disabled()
+        assert button.get_attribute("title") == ONLY_WATCHES
+    for field in page.locator(".us-session input").all():
+        assert field.is_disabled()
+    assert asked == []
 
 
 def test_an_exercise_is_not_ended_unasked(page, session, simulator):

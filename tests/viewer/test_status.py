@@ -33,7 +33,7 @@ def said(name: str = "tissue_deformer", level: Level = Level.WELL, **values: str
 
 def test_the_numbers_that_a_node_says_are_read():
     status = said()
-    assert (status.rate, status.number("dropped"), status.problems) == (59.5, 4, 6)
+    assert (status.number("rate_hz"), status.number("dropped"), status.problems) == (59.5, 4, 6)
     assert (status.state, status.number("residual"), status.number("nonsense")) == (
         "fem",
         None,
@@ -57,7 +57,7 @@ def test_a_silent_node_is_gone_and_later_forgotten():
     board.tell(said("a"), now=2.0)
     assert [s.name for s in board.nodes(now=2.9)] == ["a", "b"]
     assert [s.level for s in board.nodes(now=3.1)] == [Level.WELL, Level.GONE]
-    assert board.node("b", now=3.1).rate is None
+    assert board.node("b", now=3.1).number("rate_hz") is None
     assert [s.name for s in board.nodes(now=60.5)] == ["a"]
     assert board.node("c", now=3.0) is None
 

@@ -9,7 +9,7 @@ from awaiting import until
 from hypothesis import given
 from hypothesis import strategies as st
 
-from us_sim.viewer.stream import Feed, Packet, PageStream, Simulator
+from us_sim.viewer.stream import ONLY_WATCHES, Feed, Packet, PageStream, Simulator
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.text(),
@@ -114,6 +114,15 @@ def test_what_a_page_may_not_say_is_one_sentence() -> None:
         assert "load the page again" in wrong
     assert page.take('{"watch": ["unknown", 3, null]}') is None
     assert page.due(0.0) == ([], None)
+
+
+def test_a_page_that_only_watches_is_refused_every_command() -> None:
+    simulator, done = Simulator(feeds={"image": Feed("image")}), []
+    simulator.commands["take"] = lambda value, _: done.append(value)
+    page = PageStream(simulator, lambda: None, only_watches=True)
+    assert page.take('{"watch": ["image"], "take": "a"}') == ONLY_WATCHES
+    assert simulator.feeds["image"].is_watched
+    assert done == []
 
 
 def test_a_page_that_has_gone_watches_nothing() -> None:

@@ -7,7 +7,7 @@ import contextlib
 import json
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -20,12 +20,15 @@ from nicegui import ui
 from us_sim.errors import UsSimError
 from us_sim.slicing.settings import OVERLAYS, STRIPS
 from us_sim.viewer.export import LARGEST, exported, frames_of
+from us_sim.viewer.panels.asking import is_taken, set_parameter, why_not
 from us_sim.viewer.panels.exercise import ExercisePanel
-from us_sim.viewer.panels.nodes import build_image, build_plots, build_status, build_tissue
+from us_sim.viewer.panels.nodes import TISSUE, build_image, build_plots, build_status, build_tissue
 from us_sim.viewer.panels.session import CasesPanel, SessionPanel
 from us_sim.viewer.parameters import Kind
+from us_sim.viewer.remote_parameters import NodeParameters
 from us_sim.viewer.score import is_blind, told_score
 from us_sim.viewer.session import SessionState
+from us_sim.viewer.status import Watched
 from us_sim.viewer.stream import PageStream, Simulator
 
 NODE, OVERLAY, FLIP, BESIDE = "slice_interpolator", "overlay", "flip", "beside"
@@ -54,7 +57,6 @@ _ABSENT = {
     "across_flow": "the beams cross the flow at a right angle: tilt the probe, or steer the beams",
     "too_slow": "the flow is slower than the wall filter lets through",
 }
-TISSUE = "tissue_deformer"
 _UNMOVED = 1e-5  # m, or of the face: by how much a place that was dragged may be as it was
 
 
@@ -68,23 +70,23 @@ class ModeBar:
         self._strips: dict[str, bool] = dict.fromkeys(STRIPS, False)
         self._places: list[dict[str, Any]] = []
         with ui.row().classes("us-modes").props('role="toolbar" aria-label="Image modes"') as bar:
-            for mode, (label, title) in MODES.items():
+            for mode, (label, text) in MODES.items():
+                title = text if mode == "b-mode" else why_not() or text
                 self._buttons[mode] = _button(label, title, lambda mode=mode: self._choose(mode))
             ui.element("span").classes("us-gap")
             for kind, (label, title, _) in STRIPS.items():
                 self._buttons[kind] = _button(label, title, lambda kind=kind: self._toggle(kind))
-            for name, (label, title) in SWITCHES.items():
+            for name, (label, text) in SWITCHES.items():
+                title = why_not() or text
                 self._buttons[name] = _button(label, title, lambda name=name: self._switch(name))
         bar.on("us-place", lambda event: self._move(event.args.get("detail")), ["detail"])
         self._mark()
         self._remarks: list[str] = []
-        node, status = simulator.nodes.of(NODE), simulator.status
-        _while_connected(node.watch, node.unwatch)
-        _while_connected(status.watch, status.unwatch)
+        _watch_while_connected(simulator.nodes.of(NODE), simulator.status)
         ui.timer(0.3, self._refresh)
 
     async def _choose(self, mode: str) -> None:
-        if mode == "b-mode" or await self._set(OVERLAY, mode):
+        if mode in ("b-mode", self._overlay) or await self._set(OVERLAY, mode):
             self._show(mode)
 
     async def _switch(self, name: str) -> None:
@@ -95,10 +97,12 @@ class ModeBar:
 
     async def _set(self, name: str, value: object) -> bool:
         """Set a parameter; whether that was not refused."""
-        refused = await self._simulator.nodes.of(NODE).set(name, value)
-        if refused:
-            ui.notify(refused, type="warning", multi_line=True)
-        return not refused
+        return is_taken(await set_parameter(self._simulator.nodes.of(NODE), name, value))
+
+    @property
+    def _overlay(self) -> Any:
+        parameter = self._simulator.nodes.of(NODE).parameters.get(OVERLAY)
+        return parameter.raw if parameter else None
 
     def _is_on(self, name: str) -> bool:
         parameter = self._simulator.nodes.of(NODE).parameters.get(name)
@@ -125,8 +129,7 @@ class ModeBar:
         if places != self._places:
             self._places = places
             _call("image_tools/places.js", "setPlaces", places)
-        parameter = self._simulator.nodes.of(NODE).parameters.get(OVERLAY)
-        known = parameter.raw if parameter else None
+        known = self._overlay
         if self._mode != "b-mode" and known in MODES and known != self._mode:
             self._show(known)
         hides = is_blind(told_score(self._simulator))
@@ -134,6 +137,8 @@ class ModeBar:
             self._show("b-mode")
         for name in (*MODES, BESIDE):
             self._buttons[name].set_visibility(not hides or name == "b-mode")
+        for name in (*MODES, *SWITCHES):
+            self._buttons[name].set_enabled(not why_not() or name in ("b-mode", known))
         self._mark()
 
     def _wanted_remarks(self) -> list[str]:
@@ -253,20 +258,20 @@ def build_headline(simulator: Simulator) -> None:
         words.set_text(" · ".join(filter(None, (*known, told))))
         problem.set_text(board.state.problem)
 
-    _while_connected(board.watch, board.unwatch)
-    _while_connected(nodes.watch, nodes.unwatch)
+    _watch_while_connected(board, nodes)
     ui.timer(0.5, refresh)
 
 
-def _while_connected(begin: Callable[[], None], end: Callable[[], None]) -> None:
-    """Have ``begin`` called when the browser comes, and ``end`` when it goes, also for a moment."""
+def _watch_while_connected(*shown: Watched | NodeParameters) -> None:
+    """Watch these from when the browser comes until it goes, also for a moment."""
     connections = 0
 
     def change(by: int) -> None:
         nonlocal connections
         before, connections = connections, connections + by
         if bool(before) != bool(connections):
-            (end if before else begin)()
+            for each in shown:
+                (each.unwatch if before else each.watch)()
 
     ui.context.client.on_connect(lambda: change(1))
     ui.context.client.on_disconnect(lambda: change(-1))
@@ -433,7 +438,7 @@ async def serve_page(websocket: WebSocket, simulator: Simulator) -> None:
         if not loop.is_closed():
             loop.call_soon_threadsafe(awake.set)
 
-    page = PageStream(simulator, wake)
+    page = PageStream(simulator, wake, only_watches="watch" in websocket.query_params)
     sending = asyncio.ensure_future(_send(websocket, page, awake))
     try:
         while True:

@@ -3,7 +3,7 @@
 >>> from us_sim.viewer.status import Level, NodeStatus, StatusBoard
 >>> board = StatusBoard()
 >>> board.tell(NodeStatus("tissue_deformer", Level.WELL, "fem", {"rate_hz": "59.9"}), now=10.0)
->>> board.nodes(now=11.0)[0].rate, board.nodes(now=15.0)[0].level
+>>> board.nodes(now=11.0)[0].number("rate_hz"), board.nodes(now=15.0)[0].level
 (59.9, <Level.GONE: 'gone'>)
 """
 
@@ -64,11 +64,6 @@ class NodeStatus:
     def state(self) -> str:
         """Its activity, in words."""
         return self.values.get("state", self.message)
-
-    @property
-    def rate(self) -> float | None:
-        """Hz, of the messages that it publishes."""
-        return self.number("rate_hz")
 
     @property
     def problems(self) -> int:

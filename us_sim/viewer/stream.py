@@ -36,6 +36,7 @@ _LENGTH = struct.Struct("<I")
 _ALIGNMENT = 8  # bytes: the payload begins at a multiple, so that the page can read it as numbers
 _LONGEST = 65536  # characters of a page's message
 _numbers = itertools.count(1)
+ONLY_WATCHES = "This page only watches: open it without ?watch to change something"
 
 
 @dataclass(frozen=True)
@@ -179,10 +180,14 @@ class PageStream:
     Args:
         simulator: whose feeds and commands.
         wake: called, from any thread, when something may be due.
+        only_watches: whether the page's commands are refused.
     """
 
-    def __init__(self, simulator: Simulator, wake: Callable[[], None]) -> None:
+    def __init__(
+        self, simulator: Simulator, wake: Callable[[], None], *, only_watches: bool = False
+    ) -> None:
         self.number = next(_numbers)
+        self._only_watches = only_watches
         self._simulator, self._wake = simulator, wake
         self._watched: dict[str, Feed] = {}
         self._ready: set[str] = set()
@@ -210,7 +215,8 @@ class PageStream:
             self._ready.add(value)
             self._wake()
         elif key in self._simulator.commands:
-            return self._simulator.commands[key](value, self.number)
+            command = self._simulator.commands[key]
+            return ONLY_WATCHES if self._only_watches else command(value, self.number)
         else:
             return f"the page sent {key!r}, which the viewer does not know: load the page again"
         return None

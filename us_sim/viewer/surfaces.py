@@ -219,10 +219,6 @@ class CarriedSurfaces:
         self.coarse = [number[part] for part in coarse]
         self._surfaces = [(surface.name, surface.colour) for surface in surfaces]
 
-    def carried(self, nodes: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(V, 3) m, the vertices when the tissue's nodes (N, 3) are there."""
-        return np.einsum("va,vax->vx", self.weights, nodes[self.nodes])
-
     def told(self, kind: str, sequence: int, mesh: int) -> Packet:
         """Nodes as uint32, weights as float32, then each part's triangles, all and fewer.
 

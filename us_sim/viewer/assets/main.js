@@ -3,6 +3,7 @@
 import "./image.js";
 import "./header.js";
 import "./strips.js";
+import "./menus.js";
 import "./exercise.js";
 import "./image_tools/image_tools.js";
 import "./image_tools/places.js";

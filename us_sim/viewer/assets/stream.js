@@ -24,6 +24,9 @@ class Stream {
     addEventListener("pagehide", () => this.#socket?.close());
   }
 
+  /** Whether the address says that this page changes nothing. */
+  isWatching = new URLSearchParams(location.search).has("watch");
+
   /** Whether the viewer answers. */
   get isOpen() {
     return this.#socket?.readyState === WebSocket.OPEN;
@@ -62,7 +65,7 @@ class Stream {
 
   #open() {
     const scheme = location.protocol === "https:" ? "wss:" : "ws:";
-    const socket = new WebSocket(`${scheme}//${location.host}/us_sim/stream`);
+    const socket = new WebSocket(`${scheme}//${location.host}/us_sim/stream${this.isWatching ? "?watch" : ""}`);
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
       this.#tellWatched();

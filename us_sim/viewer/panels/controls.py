@@ -22,6 +22,7 @@ from nicegui import ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
+from us_sim.viewer.panels.asking import set_parameter, why_not
 from us_sim.viewer.parameters import Kind, Parameter
 from us_sim.viewer.remote_parameters import NodeParameters
 
@@ -155,7 +156,7 @@ class ParameterControl(Element, component="parameter_control.js"):
         self._is_asking = False
         self._span: SliderSpan | None = None
         self.props.update({"label": label or parameter.label, "tip": tip_of(parameter)})
-        self.props.update({"reason": "", "seen": 0})
+        self.props.update({"reason": "", "seen": 0, "forbidden": why_not()})
         self.props["data-parameter"] = f"{parameter.node}.{parameter.name}"
         self.on("change", self._on_change)
         self._show()
@@ -177,7 +178,7 @@ class ParameterControl(Element, component="parameter_control.js"):
         try:
             while self._wanted is not None:
                 (value, turn), self._wanted = self._wanted, None
-                reason = await self._node.set(self.parameter.name, value)
+                reason = await set_parameter(self._node, self.parameter.name, value)
         finally:
             self._is_asking = False
         if self.is_deleted:
@@ -259,13 +260,10 @@ class TimeGain(ParameterControl, component="time_gain.js"):
     def __init__(self, node: NodeParameters, parameter: Parameter, label: str = "") -> None:
         self._count = slider_count(parameter.value)
         super().__init__(node, parameter, label)
-        self._name_depths(100.0, "%")
+        self.reach(100.0, "%")
 
-    def reach(self, depth: Parameter) -> None:
+    def reach(self, end: float, unit: str) -> None:
         """The beams end at this depth."""
-        self._name_depths(float(depth.value), depth.unit)
-
-    def _name_depths(self, end: float, unit: str) -> None:
         names = [f"{place:.0f} {unit}" for place in np.linspace(0.0, end, self._count)]
         if names != self.props.get("depths"):
             self.props["depths"] = names

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
 from nicegui import ui
+from nicegui.element import Element
 
 from us_sim.scene.listing import ListedScene
 from us_sim.scoring.settings import ANSWERS, NO_ANSWER, NO_THROMBUS, STATES
+from us_sim.viewer.panels.asking import enable, is_taken, set_parameter, why_not
 from us_sim.viewer.panels.controls import WhileShown
 from us_sim.viewer.panels.session import is_sure, load_asked
 from us_sim.viewer.score import PICTURE, SCORE, is_blind, told_score
@@ -22,12 +24,6 @@ ANSWER_S = 30.0
 """For a picture to be drawn: of an hour it takes seconds, on a busy computer more."""
 TITLE = "Exercise"
 NOTHING = "No exercise is followed: choose one."
-HINTS = (
-    "Drag the probe over the skin to place it; drag down on the image to press.",
-    "The dots on the skin are the points of the list; the image says force and press.",
-    "Begin anew forgets what was done. Save the result keeps it as a page.",
-)
-"""For who sees the panel for the first time."""
 _LOOKS = {
     "done": ("Done", "check_circle"),
     "missed": ("Missed", "cancel"),
@@ -38,17 +34,21 @@ _ALT = "The probe's way over the skin, with the force; force and areas of vessel
 _SCORER = "scorer"
 
 
+class Hints(Element, component="hints.js"):
+    """What to do, for who sees the panel for the first time."""
+
+
 class ExercisePanel:
     """The panel of an exercise: every page shows the same, so that a teacher sees a learner's."""
 
     def __init__(self, simulator: Simulator) -> None:
         self._simulator, self._board = simulator, simulator.session
         self._scorer = simulator.nodes.of(_SCORER)
-        self._only_watches = "watch" in ui.context.client.request.query_params
+        self._only_watches = bool(why_not())
         self._watched: list[Feed] = []
         self._told: Mapping[str, Any] | None = None  # what is shown
         self._listed: tuple[object, ...] = ()  # exercises that are shown
-        self._parts: dict[str, Any] = {}  # of it, as they are drawn
+        self._parts: dict[Element, Any] = {}  # of it, as they are drawn
         self._picture = b""
         with WhileShown(self._begin, self._end, EVERY_S, self._refresh):
             self._choice = ui.expansion("Exercises").classes("us-cases-more")
@@ -57,8 +57,7 @@ class ExercisePanel:
             self._name = ui.label(TITLE).classes("us-heading")
             self._name.props('role="heading" aria-level="2"')
             self._about = ui.label().classes("us-note")
-            self._hints = ui.column().classes("us-steps")
-            self._show_hint(0)
+            self._hints = Hints()
             self._result = ui.label().classes("us-session-state").props('role="status"')
             self._steps = ui.column().classes("us-steps")
             self._faults = ui.column().classes("us-steps us-session-problem")
@@ -126,21 +125,11 @@ class ExercisePanel:
                 ).props("flat dense no-caps align=left")
                 button.props["title"] = f"{each.description} In {each.region.replace('_', ' ')}"
                 button.props["aria-current"] = str(is_loaded).lower()
-                may_load = state.is_there and not state.is_busy and not self._only_watches
-                button.set_enabled(may_load)
+                enable(button, state.is_there and not state.is_busy)
 
     async def _load(self, exercise: ListedScene) -> None:
         if await load_asked(self._simulator, exercise):
             self._choice.close()
-
-    def _show_hint(self, number: int) -> None:
-        self._hints.clear()
-        if number == len(HINTS):
-            return
-        with self._hints, ui.row(wrap=False).classes("us-step"):
-            ui.label(HINTS[number]).classes("us-note")
-            closing = ui.button(icon="close", on_click=lambda: self._show_hint(number + 1))
-            closing.props("flat dense round size=sm aria-label='Next hint'")
 
     def _show(self, told: Mapping[str, Any]) -> None:
         name, steps = told.get("name", ""), told.get("steps", [])
@@ -156,20 +145,18 @@ class ExercisePanel:
         count = "" if is_blind(told) else f": {sum(done)} of {len(done)} done"
         self._result.set_text(f"{state}{count}{clock}" if done else "")
         self._buttons.set_visibility(bool(name) and not self._only_watches)
-        parts = {"steps": (steps, asks), "faults": told.get("faults", [])}
-        parts |= {kind: told.get(kind, {}) for kind in ("plain", "metrics")}
-        draws = {
-            "steps": (self._steps, lambda: self._draw_steps(steps, asks)),
-            "faults": (self._faults, lambda: _draw_faults(parts["faults"])),
-            "plain": (self._plain, lambda: _draw_metrics(parts["plain"])),
-            "metrics": (self._metrics, lambda: _draw_metrics(parts["metrics"])),
-        }
-        for kind, (part, draw) in draws.items():
-            if parts[kind] != self._parts.get(kind):  # a button must not go under a click
+        parts: list[tuple[Element, Callable[..., None], tuple[Any, ...]]] = [
+            (self._steps, self._draw_steps, (steps, asks)),
+            (self._faults, _draw_faults, (told.get("faults", []),)),
+            (self._plain, _draw_metrics, (told.get("plain", {}),)),
+            (self._metrics, _draw_metrics, (told.get("metrics", {}),)),
+        ]
+        for part, draw, shown in parts:
+            if shown != self._parts.get(part):  # a button must not go under a click
                 part.clear()
                 with part:
-                    draw()
-        self._parts = parts
+                    draw(*shown)
+                self._parts[part] = shown
 
     def _draw_steps(self, steps: Sequence[Mapping[str, Any]], asks: bool) -> None:
         for number, step in enumerate(steps):
@@ -187,32 +174,34 @@ class ExercisePanel:
         is_last = number == len(points)
         with ui.row().classes("us-answers"):
             for answer in (NO_THROMBUS, *points) if is_last else ANSWERS:
-                button = ui.button(
-                    f"at {answer}" if answer.isdigit() else answer,
-                    on_click=lambda answer=answer: self._answer(number, answer, is_last),
-                ).props("outline dense no-caps size=sm")
-                button.props["aria-label"] = f"{what}: {answer}"
+                label = f"at {answer}" if answer.isdigit() else answer
+                button = ui.button(label).props("outline dense no-caps size=sm")
+                button.on_click(lambda answer=answer: self._answer(number, answer, is_last))
+                button.props["aria-label"] = f"{what}: {label}"
 
     async def _answer(self, number: int, answer: str, is_last: bool) -> None:
         if is_last:
-            refused = await self._scorer.set("thrombus", answer)
+            refused = await set_parameter(self._scorer, "thrombus", answer)
         else:
             known = self._scorer.parameters.get("answers")
             answers = [each for each in known.raw if each] if known is not None else []
             answers += [NO_ANSWER] * (number + 1 - len(answers))
             answers[number] = answer
-            refused = await self._scorer.set("answers", answers)
-        if refused:
-            ui.notify(refused, type="warning", multi_line=True)
+            refused = await set_parameter(self._scorer, "answers", answers)
+        is_taken(refused)
 
     async def _clear(self) -> None:
         name = (self._told or {}).get("name", "")
         is_running = (self._told or {}).get("state") == "running"
+        if not is_taken(why_not()):
+            return
         if not is_running or await is_sure("Begin anew", f"It ends the attempt at {name}."):
             self._simulator.ask_scorer("clear")
 
     async def _draw(self) -> bool:
         """Have the picture drawn anew; whether it was."""
+        if not is_taken(why_not()):
+            return False
         feed = self._simulator.feeds[PICTURE]
         before = feed.sequence
         self._simulator.ask_scorer("draw")

@@ -14,14 +14,15 @@ const tidy = (number) => String(Number(Number(number).toPrecision(DIGITS)));
 
 export default {
   template: `
-    <div class="us-control" :class="{'us-refused': refusal, 'us-long-unit': unit.length > 5}">
-      <label class="us-label" :for="field" :title="tip">{{ label }}</label>
+    <div class="us-control" :class="{'us-refused': refusal, 'us-long-unit': unit.length > 5}"
+      :title="forbidden || undefined">
+      <label class="us-label" :for="field" :title="forbidden || tip">{{ label }}</label>
       <template v-if="!live">
         <span class="us-fixed">{{ text }}<span v-if="unit"> {{ unit }}</span></span>
       </template>
-      <q-toggle v-else-if="kind === 'truth'" class="us-wide" dense :model-value="shown"
+      <q-toggle v-else-if="kind === 'truth'" class="us-wide" dense :disable="!!forbidden" :model-value="shown"
         :aria-label="label" :aria-description="tip" @update:model-value="set($event)" />
-      <q-select v-else-if="choices.length" class="us-wide" dense outlined options-dense
+      <q-select v-else-if="choices.length" class="us-wide" dense outlined options-dense :disable="!!forbidden"
         :for="field" :model-value="shown" :options="options" emit-value map-options
         :aria-description="tip" @update:model-value="set($event)">
         <template #option="{ itemProps, opt }">
@@ -35,11 +36,11 @@ export default {
         </template>
       </q-select>
       <template v-else>
-        <q-slider v-if="span" class="us-slider" :min="sliderLow" :max="sliderHigh"
+        <q-slider v-if="span" class="us-slider" :min="sliderLow" :max="sliderHigh" :disable="!!forbidden"
           :step="sliderStep" :model-value="position" :aria-label="label"
           :aria-valuetext="text + ' ' + unit" :class="{'us-none': shown === null}"
           @update:model-value="slide" @pan="pan" />
-        <q-input :class="span ? 'us-field' : 'us-wide'" dense outlined :for="field"
+        <q-input :class="span ? 'us-field' : 'us-wide'" dense outlined :for="field" :disable="!!forbidden"
           :suffix="shown === null ? '' : unit" :model-value="typed === null ? text : typed"
           :placeholder="optional ? 'none' : ''" :aria-label="label" :aria-description="tip"
           :inputmode="isNumber ? 'decimal' : 'text'" autocomplete="off" spellcheck="false"
@@ -60,6 +61,7 @@ export default {
     optional: Boolean, // nothing is a value, too: null
     live: Boolean,
     tip: { type: String, default: "" },
+    forbidden: { type: String, default: "" }, // why nothing may be set from this page
     reason: { type: String, default: "" }, // why the change of number `seen` was refused
     seen: { type: Number, default: 0 },
   },

@@ -164,7 +164,7 @@ class ParameterSections:
         """Have the sliders of the time gain reach to the depth of the image."""
         gains, depth = self._controls.get("time_gain"), self.node.parameters.get("depth")
         if isinstance(gains, TimeGain) and depth is not None:
-            gains.reach(depth)
+            gains.reach(float(depth.value), depth.unit)
 
 
 def build_parameters(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable
 from datetime import datetime
 from pathlib import PurePath
 from typing import Any
@@ -11,10 +11,10 @@ from typing import Any
 from nicegui import ui
 
 from us_sim.scene.listing import ListedScene
+from us_sim.viewer.panels.asking import ask_session, enable, is_taken
 from us_sim.viewer.panels.controls import WhileShown
-from us_sim.viewer.remote_parameters import in_time
 from us_sim.viewer.score import told_score
-from us_sim.viewer.session import CONTROL, NOT_THERE, SessionState
+from us_sim.viewer.session import NOT_THERE, SessionState
 from us_sim.viewer.stream import Simulator
 
 AGAIN = "Ends the scene that runs, and starts it anew, without what was set in it"
@@ -89,13 +89,11 @@ class CasesPanel:
                     ui.label(scene.problem).classes("us-session-problem")
             with ui.row().classes("us-case-foot"):
                 ui.label("loaded" if is_loaded else "").classes("us-accent")
-                button = ui.button(
-                    "Load again" if is_loaded else "Load",
-                    on_click=lambda: load_asked(self._simulator, scene),
-                ).props("flat dense no-caps")
-                button.props["aria-label"] = f"Load {scene.name}"
-                button.set_enabled(state.is_there and not state.is_busy and not scene.problem)
+                label = "Load again" if is_loaded else "Load"
+                button = ui.button(label, on_click=lambda: load_asked(self._simulator, scene))
+                button.props("flat dense no-caps").props["aria-label"] = f"{label} {scene.name}"
                 button.props["title"] = AGAIN if is_loaded else ANOTHER
+                enable(button, state.is_there and not state.is_busy and not scene.problem)
 
 
 async def load_asked(simulator: Simulator, scene: ListedScene) -> bool:
@@ -110,10 +108,7 @@ async def load_asked(simulator: Simulator, scene: ListedScene) -> bool:
     sentence = f"Loading {scene.name} ends {', and '.join(ends)}."
     if ends and not await is_sure("Load", sentence):
         return False
-    refused = await in_time(simulator.session.ask(scene=scene.origin), CONTROL)
-    if refused:
-        ui.notify(refused, type="warning", multi_line=True)
-    return not refused
+    return is_taken(await ask_session(simulator.session, scene=scene.origin))
 
 
 async def is_sure(what: str, sentence: str) -> bool:
@@ -200,16 +195,19 @@ class SessionPanel:
             self._play.props('dense aria-label="Play or pause" title="Play, pause, go on"')
             self._close = ui.button(icon="stop", on_click=lambda: self._ask(replay=""))
             self._close.props('dense aria-label="End replay" title="End the replay"')
-            set_rate, set_loop = map(self._by_person, (self._set_rate, self._set_loop))
-            self._rate = ui.select(RATES, value=1.0, label="speed", on_change=set_rate)
+            self._rate = ui.select(RATES, value=1.0, label="speed")
+            self._rate.on_value_change(lambda event: self._change(replay_rate=float(event.value)))
             self._rate.props('dense outlined title="Speed factor"').classes("us-session-rate")
-            self._loop = ui.switch("loop", value=False, on_change=set_loop)
+            self._loop = ui.switch("loop", value=False)
+            self._loop.on_value_change(lambda event: self._change(replay_loop=bool(event.value)))
             self._loop.props["title"] = "Begin again at the end"
         self._time = ui.slider(min=0.0, max=1.0, step=0.01, value=0.0)
         self._time.props('aria-label="Time in the replay, s" title="Time in the replay, s"')
         self._time.on("update:model-value", self._drag)
         self._time.on("change", self._seek)
         self._where = ui.label().classes("us-quiet").props('role="status"')
+        for control in (self._file, self._record, self._bag, self._play, self._rate, self._loop):
+            enable(control)
 
     def _refresh(self) -> None:
         board, state = self._board, self._board.state
@@ -223,9 +221,9 @@ class SessionPanel:
                 self._file.set_value(PurePath(state.record).name)
             else:
                 self._propose()
-        self._file.set_enabled(not state.record)
-        self._record.set_enabled(not state.record and state.replay_as == "path")
-        self._stop.set_enabled(bool(state.record))
+        enable(self._file, not state.record)
+        enable(self._record, not state.record and state.replay_as == "path")
+        enable(self._stop, bool(state.record))
         told, is_short = recorded(state) if state.is_recording else ("", False)
         begun = "recording to" if state.is_recording else f"{state.record_state}:"
         self._recorded.set_text(f"{begun} {state.record}{told}" if state.record else "")
@@ -245,8 +243,8 @@ class SessionPanel:
         is_running = plays and state.is_playing
         self._play.set_icon("pause" if is_running else "play_arrow")
         for control in (self._close, self._time):
-            control.set_enabled(plays)
-        self._kind.set_enabled(not plays)
+            enable(control, plays)
+        enable(self._kind, not plays)
         fixed = "While something is replayed this cannot be changed: end the replay first"
         self._kind_told.props["title"] = fixed if plays else KINDS_TOLD
         end = round(state.duration, 2)
@@ -310,15 +308,9 @@ class SessionPanel:
                 replay_rate=float(self._rate.value),
             )
 
-    def _by_person(self, change: Callable[[], Awaitable[None]]) -> Callable[[], Any]:
-        """The change where a person has moved a control, and nothing while it follows."""
-        return lambda: None if self._is_following else change()
-
-    async def _set_rate(self) -> None:
-        await self._ask(replay_rate=float(self._rate.value))
-
-    async def _set_loop(self) -> None:
-        await self._ask(replay_loop=bool(self._loop.value))
+    def _change(self, **values: object) -> Awaitable[bool] | None:
+        """Ask for what a person has moved a control to, and for nothing while it follows."""
+        return None if self._is_following else self._ask(**values)
 
     def _drag(self, event: Any) -> None:
         """Keep the time that a person points at; the replay's may come before the button is up."""
@@ -332,13 +324,11 @@ class SessionPanel:
         """Ask for it; whether that was taken."""
         self._asking += 1
         try:
-            refused = await in_time(self._board.ask(**values), CONTROL)
+            refused = await ask_session(self._board, **values)
         finally:
             self._asking -= 1
             self._answered = time.monotonic()
-        if refused:
-            ui.notify(refused, type="warning", multi_line=True)
-        return not refused
+        return is_taken(refused)
 
 
 def recorded(state: SessionState) -> tuple[str, bool]:

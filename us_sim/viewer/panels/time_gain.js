@@ -3,15 +3,16 @@ const PAUSE = 100; // ms between two changes that are sent
 
 export default {
   template: `
-    <div class="us-time-gain" role="group" :aria-label="label" :aria-description="tip">
+    <div class="us-time-gain" role="group" :aria-label="label" :aria-description="tip"
+      :title="forbidden || undefined">
       <div class="us-time-gain-head">
         <span class="us-label" :title="tip">{{ label }}</span>
-        <button type="button" class="us-level" :disabled="isFlat" @click="flatten"
+        <button type="button" class="us-level" :disabled="isFlat || !!forbidden" @click="flatten"
           title="the same gain at all depths: 0 dB">level</button>
       </div>
       <div v-for="(gain, i) in shown" :key="i" class="us-gain">
         <span class="us-depth">{{ depths[i] }}</span>
-        <q-slider :min="low" :max="high" :step="0.5" :inner-min="low" :model-value="gain"
+        <q-slider :disable="!!forbidden" :min="low" :max="high" :step="0.5" :inner-min="low" :model-value="gain"
           selection-color="transparent" :aria-label="label + ' at ' + depths[i]"
           :aria-valuetext="gain + ' ' + unit" @pan="isDragged = $event === 'start'"
           @update:model-value="slide(i, $event)" />
@@ -27,6 +28,7 @@ export default {
     low: Number,
     high: Number,
     tip: String,
+    forbidden: { type: String, default: "" }, // why nothing may be set from this page
     reason: { type: String, default: "" },
     seen: { type: Number, default: 0 },
   },

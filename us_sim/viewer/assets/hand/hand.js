@@ -27,8 +27,7 @@ let isDue = false;
 let isMine = Boolean(kept);
 /** Whether another page has taken the probe from this one. */
 let isTaken = false;
-/** Whether the address says that this page never moves the probe. */
-const isWatching = new URLSearchParams(location.search).has("watch");
+const { isWatching } = stream;
 addEventListener("pagehide", () => isMine && sessionStorage.setItem(KEPT, source));
 let heard = 0;
 let isSilent = false;

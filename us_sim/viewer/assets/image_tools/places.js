@@ -131,7 +131,7 @@ function draw() {
     const d = linesOf(current(known), map)
       .map((line) => `M${line.map((point) => screen.toScreen(point).map((n) => n.toFixed(1)).join(",")).join("L")}`)
       .join("");
-    for (const name of ["us-place", "us-grip"]) {
+    for (const name of stream.isWatching ? ["us-place"] : ["us-place", "us-grip"]) {
       const path = document.createElementNS(SVG, "path");
       path.setAttribute("d", d);
       path.classList.add(name);
