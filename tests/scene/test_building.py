@@ -114,7 +114,7 @@ def test_labels_that_are_not_there_are_named(organ):
         },
         origin="my.yaml",
     )
-    with pytest.raises(SceneError, match=r"my.yaml: structures.stone: .*`kidney`.*skin, "):
+    with pytest.raises(SceneError, match=r"my.yaml: structures.stone.label: .*`kidney`.*skin, "):
         require_labels(unknown, volume.label_names)
 
 

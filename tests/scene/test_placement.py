@@ -125,7 +125,7 @@ def test_the_command_places_images_at_rest(pressed, small_scene, tmp_path, capsy
     words[words.index(str(out))] = str(tmp_path / "rest")
     assert main([*words, "--undo-pressure", str(small_scene)]) == 0
     start = read_case(tmp_path / "rest").settings.start
-    assert start.position[2] == pytest.approx(0.0, abs=1e-3)  # not where it had pressed
+    assert 0.0 <= start.position[2] < 2e-3 < PRESS  # two voxels, not where it had pressed
     np.testing.assert_allclose(start.pose.rotation, np.eye(3), atol=1e-6)
 
 
