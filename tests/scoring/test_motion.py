@@ -146,9 +146,9 @@ def test_every_value_of_perk_tutors_tables(shared_data, name, read):
     folder = shared_data / "perktutor-truth" / name
     times, devices, surface = read(folder)
     with (folder / "TrueMetricsTable.tsv").open() as stream:
-        table = list(csv.DictReader(stream, delimiter="\t"))
-    assert len(table) == 9
-    for row in table:
+        rows = list(csv.DictReader(stream, delimiter="\t"))
+    assert len(rows) == 9
+    for row in rows:
         device = row["MetricRoles"].split(" = ")[1].split(",")[0]
         moved = motion(times, devices[device])
         own = table(moved)
