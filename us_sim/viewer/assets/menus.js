@@ -1,16 +1,17 @@
 /**
- * Quasar's menus, which stand in the body beside all parts of the page: each becomes a part that
- * assistive technology lists, and what holds its options a group, as a listbox may have.
+ * Quasar's menus, which stand in the body beside all parts of the page: each that is open becomes
+ * a part that assistive technology lists, and what holds its options a group, as a listbox may have.
  */
 
 function describe(portal) {
-  portal.setAttribute("role", "region");
-  portal.setAttribute("aria-label", "Choices");
-  const group = () => {
+  const update = () => {
+    const isOpen = portal.firstElementChild !== null; // one that is closed stays, empty
+    portal.role = isOpen ? "region" : null;
+    portal.ariaLabel = isOpen ? "Choices" : null;
     for (const held of portal.querySelectorAll(".q-virtual-scroll__content")) held.role = "group";
   };
-  group();
-  new MutationObserver(group).observe(portal, { childList: true, subtree: true });
+  update();
+  new MutationObserver(update).observe(portal, { childList: true, subtree: true });
 }
 
 new MutationObserver((changes) => {
