@@ -24,7 +24,7 @@ def import_options(parser: argparse.ArgumentParser) -> None:
         "--out",
         type=Path,
         metavar="CASE|FILE",
-        help="new folder of a case, volume (.nrrd, .mha, .nii, .nii.gz), or .igs.mha for 2D images",
+        help="new folder of a case, or volume (.nrrd, .mha, .nii, .nii.gz)",
     )
     parser.add_argument(
         "--picture",

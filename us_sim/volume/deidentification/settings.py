@@ -58,8 +58,7 @@ class ImportSettings(Settings):
         Quantity("number", 1, 10000), "which one where there are several in time", default=1
     )
     spacing: str | None = setting(
-        description="X,Y,Z: mm between voxels, or X,Y between pixels, of files that do not say it",
-        default=None,
+        description="X,Y,Z: mm between voxels, of files that do not say it", default=None
     )
 
     def check(self) -> None:
@@ -68,16 +67,16 @@ class ImportSettings(Settings):
             why = "is no rectangle with a pixel; write X0,Y0,X1,Y1, the last ones included"
             raise self.refused("crop", why)
         if self.spacing is not None and not self.spacing_mm:
-            raise self.refused("spacing", "is no two or three numbers of mm; write 0.3,0.3,1")
+            raise self.refused("spacing", "is no three numbers of mm; write 0.3,0.3,1")
 
     @property
     def spacing_mm(self) -> tuple[float, ...]:
-        """(3,) or (2,) mm, of files that do not state it; empty where it is not given."""
+        """(3,) mm, of files that do not state it; empty where it is not given."""
         try:
             found = tuple(float(word) for word in (self.spacing or "").split(","))
         except ValueError:
             return ()
-        return found if len(found) in (2, 3) and all(1e-4 <= each <= 100 for each in found) else ()
+        return found if len(found) == 3 and all(1e-4 <= each <= 100 for each in found) else ()
 
     @property
     def part(self) -> Rectangle | None:

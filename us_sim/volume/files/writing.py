@@ -1,4 +1,4 @@
-"""Volumes, labels and image sequences into files: NRRD, MetaImage and NIfTI.
+"""Volumes and labels into files: NRRD, MetaImage and NIfTI.
 
 A file is written beside its place under another name and renamed, so it is whole or absent.
 """
@@ -6,7 +6,7 @@ A file is written beside its place under another name and renamed, so it is whol
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -66,51 +66,6 @@ def write_labels(
     if path.name.lower().endswith(".nrrd"):
         fields = _segment_fields(volume.labels, volume.label_names, dict(colours or {}))
     _write_image(path, volume.labels, volume, fields, packed=True)
-
-
-def write_image_sequence(
-    path: Path,
-    images: Iterable[NDArray[np.uint8]],
-    shape: tuple[int, int, int],
-    times: Sequence[float],
-    pixel_mm: tuple[float, float] = (1.0, 1.0),
-) -> None:
-    """Write images and their times, without poses, as a MetaImage sequence of Plus.
-
-    Args:
-        path: ends in .mha.
-        images: (rows, columns), in order.
-        shape: number of images, rows, columns.
-        times: s, of each image.
-        pixel_mm: width and height of a pixel.
-
-    Raises:
-        VolumeError: the name ends otherwise, or the file cannot be written.
-    """
-    if not path.name.lower().endswith(".mha"):
-        raise VolumeError(f"{path}: a sequence of images is written as .igs.mha or .mha")
-    count, rows, columns = shape
-    fields = {
-        "ObjectType": "Image",
-        "NDims": "3",
-        "BinaryData": "True",
-        "BinaryDataByteOrderMSB": "False",
-        "CompressedData": "False",
-        "DimSize": f"{columns} {rows} {count}",
-        "ElementSpacing": f"{pixel_mm[0]:.9g} {pixel_mm[1]:.9g} 1",
-        "ElementType": "MET_UCHAR",
-        "Kinds": "domain domain list",
-        "UltrasoundImageOrientation": "MFA",
-        "UltrasoundImageType": "BRIGHTNESS",
-    }
-    for number, time in enumerate(times):
-        fields[f"Seq_Frame{number:04}_ImageStatus"] = "OK"
-        fields[f"Seq_Frame{number:04}_Timestamp"] = f"{time:.9g}"
-    fields["ElementDataFile"] = "LOCAL"
-    with partial_file(path, "image.mha") as partial, partial.open("wb") as file:
-        file.write("".join(f"{key} = {value}\n" for key, value in fields.items()).encode("ascii"))
-        for image in images:
-            file.write(np.ascontiguousarray(image).tobytes())
 
 
 def _segment_fields(

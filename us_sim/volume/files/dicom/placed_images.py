@@ -11,8 +11,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate, pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -79,11 +77,6 @@ def opened_images(paths: Sequence[str | os.PathLike[str]]) -> GreyImages:
     return GreyImages(files)
 
 
-def is_flat(images: GreyImages, spacing: Sequence[float] = ()) -> bool:
-    """Tell whether the images are no volume: they have no place, or all the same one."""
-    return len({plane.position for plane in _planes(images, spacing)}) < 2
-
-
 def placed_images(
     images: GreyImages, volume: int = 1, spacing: Sequence[float] = ()
 ) -> PlacedImages:
@@ -138,19 +131,18 @@ def placed_images(
 
 def _why_flat(images: GreyImages, planes: Sequence[Plane]) -> str:
     """Say what the files are that hold no volume, with advice."""
-    name, count = Path(images.path).name, len(images.all)
-    as_images = f"import it as 2D images: `us-sim import {name} --out images.igs.mha`"
+    count = len(images.all)
     if len(planes) == 1:
         return "is one slice of a volume; put the files of its series into one folder, and name it"
     if planes:
-        return f"holds {count} images at one place, one after another in time; {as_images}"
+        return f"holds {count} images at one place, one after another in time, and no volume"
     if numbers(images.files[0], "ImagePositionPatient", 3):
         return (
             "states where its images lie, but not the size of pixels: say it with `us-sim import "
             "--spacing X,Y,Z` (mm)"
         )
     kind = "a 2D image" if count == 1 else f"2D, with {count} images"
-    return f"is {kind}, not a volume: nothing says where its images lie; {as_images}; {EXPORT}"
+    return f"is {kind}, not a volume: nothing says where its images lie; {EXPORT}"
 
 
 def _grid_of(path: str, planes: Sequence[Plane]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -261,22 +253,3 @@ def _kind_of(groups: tuple[Any, ...]) -> str:
     """Read the kind of an image's values; empty where none is stated."""
     types = (item for group in groups for item in items(group, "ImageDataTypeSequence"))
     return next((text(item, "DataType") for item in types), "")
-
-
-def frame_times(header: Any, frames: int) -> list[float] | None:
-    """Return times of a cine's images in s, from the first on; None where none are stated.
-
-    `FrameTimeVector` says how long after the one before it each image came, `FrameTime` and the
-    rates say it of all (PS3.3, C.7.6.5). Without these, images of enhanced objects may state the
-    times of their volumes.
-    """
-    steps = numbers(header, "FrameTimeVector", frames)[1:]  # ms
-    if not steps:
-        rate = number(header, "CineRate") or number(header, "RecommendedDisplayFrameRate")
-        step = number(header, "FrameTime") or (1e3 / rate if rate else None)
-        steps = (step,) * (frames - 1) if step else ()
-    if frames == 1 or (steps and all(0.0 <= step < 1e7 for step in steps)):
-        return list(accumulate((step * 1e-3 for step in steps), initial=0.0))
-    times = [_time_of(groups) for groups in groups_of(header, frames)]
-    is_rising = len(times) == frames and all(a < b for a, b in pairwise(times))
-    return [time - times[0] for time in times] if is_rising else None
