@@ -121,9 +121,7 @@ def test_commands_on_files_do_their_work(python, tmp_path, small_scene):
     words = {
         "bag info": ["bag", "info", session],
         "bag check": ["bag", "check", session],
-        "bag diff": ["bag", "diff", session, session, "--out", folder / "diff"],
         "bag extract": ["bag", "extract", session, "--out", folder / "x", "--poses", "--images"],
-        "bag repair": ["bag", "repair", session, "--out", folder / "repaired.mcap"],
         "score": ["score", session, "--out", folder / "score"],
         "reconstruct": ["reconstruct", sweep, "--out", folder / "r.nrrd", "--spacing", "1 mm"],
         "import": ["import", volume, "--out", folder / "case"],

@@ -50,7 +50,7 @@ def test_ctrl_c(played_scene, tmp_path, images):
     assert demo.returncode == 130
     assert b"Traceback" not in demo.stderr.read()
     assert message_count(recording, IMAGES) >= images
-    assert not recording.exists() or not read_bag(recording).note  # no node was killed
+    assert not recording.exists() or not read_bag(recording).fault  # no node was killed
 
 
 def test_more_than_one_ctrl_c_does_not_break_off_the_end(tmp_path):

@@ -63,7 +63,7 @@ def test_scenes_recordings_and_replays_are_changed_while_it_runs(
     control.until(lambda: nodes_of(run.pid).keys() == before.keys() and control.state == "running")
     after = nodes_of(run.pid)  # the tracker took poses from its own source meanwhile
     assert {node for node in after if after[node] != before[node]} == {"probe_tracker"}
-    control.until(lambda: not read_bag(tmp_path / "session.mcap").note)  # it has its index
+    control.until(lambda: not read_bag(tmp_path / "session.mcap").fault)  # it has its index
     bag = read_bag(tmp_path / "session.mcap")
     assert bag.topic("/ultrasound/image").message_count > 5
 

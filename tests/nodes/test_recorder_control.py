@@ -24,9 +24,9 @@ from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.session_recorder import SessionRecorder
 from us_sim.nodes.sessions.recorded_topic import RecordedTopic
+from us_sim.recording.attached_files import extract
 from us_sim.recording.path import ProbePath, write_path
 from us_sim.recording.reader import read_bag
-from us_sim.recording.repair import extract
 from us_sim.recording.topic import DEFAULT_QOS
 from us_sim.recording.writer import BagWriter, PatientFile
 from us_sim.scene.building import path_of
@@ -178,7 +178,7 @@ def test_the_bag_that_was_played_is_attached_whole(bench, tmp_path, small_scene,
     kept = tmp_path / "again" / (played or "own")
     assert again.path == again.tracker.file == str(kept)
     assert list(read_bag(kept).messages()) == list(read_bag(other if played else own).messages())
-    assert not read_bag(kept).note
+    assert not read_bag(kept).fault
     session = bag_of(tmp_path / "probe", "patient", 0.03, "/probe/pose")
     assert path_of(again, session).frame_id == "patient"  # the probe's own
     elsewhere = bag_of(tmp_path / "elsewhere", "moon")
@@ -300,10 +300,12 @@ def test_each_message_of_publishers_of_every_kind_is_recorded_once(bench, tmp_pa
     bench.spin_until(lambda: recorder.health.received >= len(said))
     end(bench, recorder)
     assert sorted(texts(file)) == sorted(said)
-    profiles = read_bag(tmp_path).metadata.topics[0].qos
-    assert [(q.reliability.name, q.durability.name) for q in profiles] == [
-        ("RELIABLE", "TRANSIENT_LOCAL"),
-        ("BEST_EFFORT", "VOLATILE"),
+    document = yaml.safe_load((tmp_path / "metadata.yaml").read_text())
+    topic = document["rosbag2_bagfile_information"]["topics_with_message_count"][0]
+    profiles = topic["topic_metadata"]["offered_qos_profiles"]
+    assert [(each["reliability"], each["durability"]) for each in profiles] == [
+        ("reliable", "transient_local"),
+        ("best_effort", "volatile"),
     ]
 
 
@@ -346,7 +348,7 @@ def test_a_further_file_is_begun_only_where_that_is_asked_for(bench, tmp_path):
     assert re.search(r"72\d\d\.\d s", note)
     end(bench, recorder)
     assert file.read_bytes() == b"precious"
-    assert not read_bag(tmp_path / "session_1.mcap").note
+    assert not read_bag(tmp_path / "session_1.mcap").fault
 
 
 @pytest.mark.slow

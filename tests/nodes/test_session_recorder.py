@@ -36,7 +36,7 @@ def test_what_is_published_is_recorded_as_it_was(bench, tmp_path):
     bench.executor.remove_node(recorder)
     recorder.destroy_node()
     bag = read_bag(file)
-    assert not bag.note
+    assert not bag.fault
     messages = list(bag.messages(["/tracker/pose"]))
     assert [deserialize_message(bytes(m.data), PoseStamped) for m in messages] == sent
     assert {len(m.data) for m in messages} == {len(serialize_message(sent[0]))}

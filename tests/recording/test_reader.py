@@ -38,7 +38,7 @@ def contents_by_mcap(file):
         ]
 
 
-@pytest.mark.parametrize("name", ["mcap", "chunkzstd", "zstd", "sqlite3"])
+@pytest.mark.parametrize("name", ["mcap", "chunkzstd", "sqlite3"])
 def test_real_bags_as_rosbags_reads_them(shared_data, name):
     folder = shared_data / f"ros2-jazzy/bags/probe_path_{name}"
     bag = read_bag(folder)
@@ -55,8 +55,8 @@ def test_real_bags_as_rosbags_reads_them(shared_data, name):
             ]
     read = [(m.topic, m.log_time, m.data) for m in bag.messages()]
     assert read == expected
-    assert len(read) == bag.message_count == bag.metadata.message_count
-    assert not bag.note
+    assert len(read) == bag.message_count
+    assert not bag.fault
 
 
 @pytest.mark.slow
@@ -97,7 +97,7 @@ def test_known_contents_of_rosbag2s_own_tests(shared_data):
     seek = read_bag(root / "rosbag2_transport/test/resources/mcap/test_bag_for_seek")
     assert [topic.type_name for topic in seek.topics] == ["test_msgs/msg/BasicTypes"]
     assert [seek.deserialize(m).int32_value for m in seek.messages()] == [1, 2, 3, 4, 5]
-    with pytest.raises(BagError, match=r"empty_bag_0.db3"):
+    with pytest.raises(BagError, match=r"holds no bag"):
         read_bag(root / "ros2bag/test/resources/empty_bag")
     with pytest.raises(BagError, match=r"only_services.mcap, only_topics.mcap"):
         read_bag(root / "rosbag2_cpp/test/rosbag2_cpp/bags")
@@ -127,8 +127,8 @@ def test_a_file_cut_anywhere_gives_what_was_before_the_cut(
     read = list(bag.messages())
     assert read == list(read_bag(sessions[compression]).messages())[: len(read)]
     assert bag.message_count == len(read)
-    assert bag.note
-    assert f"{len(read)} messages over" in bag.note
+    assert bag.fault
+    assert f"{len(read)} messages over" in bag.fault
 
 
 @pytest.fixture(scope="module")
@@ -163,12 +163,6 @@ def test_messages_compressed_one_by_one(tmp_path):
         for message in plain:
             data = zstandard.compress(message.data)
             packed.write(message.topic, data, message.log_time, message.publish_time)
-    metadata = tmp_path / "packed/metadata.yaml"
-    metadata.write_text(
-        metadata.read_text()
-        .replace('compression_format: ""', "compression_format: zstd")
-        .replace('compression_mode: ""', "compression_mode: message")
-    )
     assert list(read_bag(tmp_path / "packed").messages()) == plain
 
 
@@ -244,22 +238,9 @@ def test_blocks_of_zeros_after_a_power_cut(tmp_path, sessions):
     file.write_bytes(content[: len(content) // 3] + bytes(5000))
     bag = read_bag(file)
     read = list(bag.messages())
-    assert bag.note
+    assert bag.fault
     assert 10 < len(read) < 100
     assert read == list(read_bag(sessions["none"]).messages())[: len(read)]
-
-
-def test_a_compressed_file_leaves_nothing_behind(tmp_path, monkeypatch):
-    write_session(tmp_path / "bag.mcap")
-    packed = tmp_path / "bag.mcap.zstd"
-    packed.write_bytes(zstandard.compress((tmp_path / "bag.mcap").read_bytes()))
-    scratch = tmp_path / "scratch"
-    scratch.mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(scratch))
-    bag = read_bag(packed)
-    assert (bag.message_count, len(list(scratch.iterdir()))) == (200, 1)
-    del bag
-    assert not list(scratch.iterdir())
 
 
 def test_an_old_database_and_its_journal(tmp_path):
@@ -289,15 +270,6 @@ def test_an_old_database_and_its_journal(tmp_path):
         bag.deserialize(thing)
 
 
-def test_messages_that_metadata_promises_and_the_files_lack_are_said(tmp_path):
-    write_session(tmp_path / "bag", count=20)
-    metadata = tmp_path / "bag" / "metadata.yaml"
-    text = metadata.read_text()
-    assert "\n  message_count: 20\n" in text
-    metadata.write_text(text.replace("\n  message_count: 20\n", "\n  message_count: 25\n"))
-    assert read_bag(tmp_path / "bag").note.endswith("5 were lost")
-
-
 @pytest.mark.parametrize(
     ("name", "content", "word"),
     [
@@ -306,7 +278,7 @@ def test_messages_that_metadata_promises_and_the_files_lack_are_said(tmp_path):
         ("a.mcap", b"\x89MCAP", "MCAP nor SQLite"),
         ("a.mcap", b"#ROSBAG V2.0\n", "is a bag of ROS 1"),
         ("a.mcap", b"hello, world, this is a text", "is not a bag"),
-        ("a.mcap.zstd", zstandard.compress(bytes(range(256)))[:100], "a.mcap.zstd"),
+        ("a.mcap.zstd", zstandard.compress(bytes(range(256))), "`zstd -d` unpacks it"),
         ("ros2-jazzy/bags/probe_path_killed", None, "is empty"),
         ("ros2-jazzy/bags/probe_path_sqlite3/probe_path_sqlite3_0.db3", 100_000, "damaged"),
     ],

@@ -87,7 +87,7 @@ def test_a_full_disk_is_written_to_again_when_there_is_room(tmp_path, monkeypatc
     bag.put("/a", bytes(1000), EPOCH + 1000)
     bag.close()
     whole = read_bag(tmp_path)
-    assert not whole.note
+    assert not whole.fault
     times = [message.log_time - EPOCH for message in whole.messages()]
     assert times[-1] == 1000
     assert whole.lost() == bag.losses

@@ -47,7 +47,7 @@ def measured(monkeypatch, poses, nodes):
     scanner = BMode(cone(), PROBE)
     scanner.carry(BLOCK.nodes, BLOCK.tetrahedra)
     monkeypatch.setattr(Session, "scanner_of_vessels", lambda *_: ({"vein": (1,)}, scanner))
-    areas = session.lumen_areas(None, 100)
+    areas = session.measure_lumens(None, 100).areas()
     assert isinstance(areas, LumenAreas)
     return areas
 

@@ -96,7 +96,7 @@ def test_what_becomes_of_images_is_told(tmp_path):
     file = write(tmp_path / "gap.mcap", messages, {"/image": TYPES["/ultrasound/image"]})
     _, frames, _, told = frames_of(file, 5)
     assert [f["observation.images.image"][0, 0] for f in frames] == [0, 2, 2, 3, 6]
-    shown = "/image: 4 of 6 images shown, 1 frame repeats the one before, which is 0.200 s old"
+    shown = "/image: 4 of 6 images shown, which are 0.200 s old"
     late = "1 message is stamped before one that was recorded earlier"
     assert told == ["5 frames", f"{shown} at most; {late}"]
 

@@ -1,12 +1,9 @@
-"""The command `us-sim bag`: list, check, compare, extract, repair and convert recordings."""
+"""The command `us-sim bag`: list, check, extract and convert recordings."""
 
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
-
-from us_sim.errors import UsSimError
 
 _EXTRACTED = {
     "poses": "poses of each topic as CSV",
@@ -26,13 +23,6 @@ def bag_options(bag: argparse.ArgumentParser) -> None:
     )
     check.add_argument("file", type=Path, metavar="SESSION")
     check.set_defaults(command=_check)
-    diff = bag_commands.add_parser(
-        "diff", help="how far two recordings of the same poses are apart; status 0 if they are not"
-    )
-    diff.add_argument("one", type=Path, metavar="A")
-    diff.add_argument("other", type=Path, metavar="B")
-    diff.add_argument("--out", type=Path, help="folder for the numbers as CSV")
-    diff.set_defaults(command=_diff)
     extract = bag_commands.add_parser(
         "extract",
         help="write the files attached to a recording, such as its scene; or, with options, its "
@@ -43,14 +33,6 @@ def bag_options(bag: argparse.ArgumentParser) -> None:
     for name, text in _EXTRACTED.items():
         extract.add_argument(f"--{name}", action="store_true", help=text)
     extract.set_defaults(command=_extract)
-    repair = bag_commands.add_parser(
-        "repair", help="all that can be read of a damaged or cut recording, as a new one"
-    )
-    repair.add_argument("file", type=Path)
-    repair.add_argument(
-        "--out", type=Path, help="new folder or .mcap file (default: FILE_repaired beside it)"
-    )
-    repair.set_defaults(command=_repair)
     lerobot = bag_commands.add_parser(
         "to-lerobot", help="sessions as the episodes of a LeRobot data set, resampled to one rate"
     )
@@ -95,26 +77,8 @@ def _check(args: argparse.Namespace) -> int:
     return int(bool(found.findings))
 
 
-def _diff(args: argparse.Namespace) -> int:
-    """As diff: 0 if they are equal, 1 if they differ, 2 if they cannot be compared."""
-    from us_sim.progress import end_late_bars, late_progress
-    from us_sim.recording.reader import read_bag
-    from us_sim.run.session_diff import diff, table, write
-
-    try:
-        found = diff(read_bag(args.one), read_bag(args.other), late_progress("bag diff"))
-        print(table(found))
-        if args.out is not None:
-            print(write(found, args.out))
-    except UsSimError as error:
-        end_late_bars()
-        print(f"us-sim: {error}", file=sys.stderr)
-        return 2
-    return int(not found.is_none)
-
-
 def _extract(args: argparse.Namespace) -> int:
-    from us_sim.recording.repair import extract
+    from us_sim.recording.attached_files import extract
 
     asked = [name for name in _EXTRACTED if vars(args)[name]]
     if not asked:
@@ -128,18 +92,6 @@ def _extract(args: argparse.Namespace) -> int:
     show = late_progress(f"bag extract {args.file.name}")
     for line in write_parts(read_bag(args.file), args.out, asked, show):
         print(line)
-    return 0
-
-
-def _repair(args: argparse.Namespace) -> int:
-    from us_sim.recording.repair import repair
-    from us_sim.settings.spelling import counted
-
-    file: Path = args.file
-    made = repair(file, args.out or file.with_name(f"{file.stem}_repaired"))
-    for fault in made.faults:
-        print(fault.text)
-    print(f"{counted(made.message_count, 'message is', 'messages are')} in {made.path}")
     return 0
 
 

@@ -37,7 +37,7 @@ from us_sim.environment.environment import ScanEnvironment, scene_of
 from us_sim.environment.tasks import TASKS
 from us_sim.errors import EpisodeError, UsSimError
 from us_sim.progress import Progress
-from us_sim.recording.repair import versions
+from us_sim.recording.attached_files import versions
 from us_sim.scene.scene import Scene
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import document_of

@@ -15,7 +15,7 @@ from us_sim.nodes.sessions.playback import Player
 from us_sim.nodes.sessions.recorded_topic import message_type
 from us_sim.nodes.settings import SessionPlayerSettings
 from us_sim.recording.reader import read_bag
-from us_sim.recording.topic import BagMessage, BagTopic, Fault
+from us_sim.recording.topic import BagMessage, BagTopic
 
 DEPTH = 10  # messages that publishers keep
 
@@ -45,8 +45,8 @@ class SessionPlayer(Player):
         if left_out:
             self.health.warning = f"{'; '.join(left_out)}: left out"
             self.get_logger().warning(self.health.warning)
-        if self._bag.note:
-            self.get_logger().warning(self._bag.note)
+        if self._bag.fault:
+            self.get_logger().warning(self._bag.fault)
         self._messages: Iterator[BagMessage] = iter(())
         self._waiting: BagMessage | None = None
         self._shown = -1  # of the recording, ns: until when it is shown while it is paused
@@ -115,10 +115,10 @@ class SessionPlayer(Player):
         try:
             message = next(self._messages, None)
         except BagError as error:
-            self.damage.append(Fault(str(error)))
+            self.damage.append(str(error))
             message = None
         for fault in self.damage[known:]:
-            self.health.problem("damage", fault.text)
+            self.health.problem("damage", fault)
         return message
 
 

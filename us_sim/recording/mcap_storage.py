@@ -1,7 +1,7 @@
 """Reading one MCAP file: by the index in its summary, or else by a walk through its records.
 
-The records are mcap's. Its ``iter_messages`` is not used: it ends at the first damaged chunk and
-before the end of a file that was cut, and takes 3.4 times as long as this for small messages.
+The records are mcap's. Its ``iter_messages`` is not used: it ends before the end of a file that was
+cut, and takes 3.4 times as long as this for small messages.
 """
 
 from __future__ import annotations
@@ -27,16 +27,15 @@ from mcap.writer import MCAP0_MAGIC
 
 from us_sim.errors import BagError
 from us_sim.recording.schemas import normalized_type
-from us_sim.recording.topic import BagMessage, BagTopic, Fault, qos_from_yaml
+from us_sim.recording.topic import BagMessage, BagTopic, qos_from_yaml
 
 _HEADER = struct.Struct("<BQ")  # opcode, length of what follows
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _CHUNK = struct.Struct("<QQQII")  # start, end, size, CRC, length of the compression's name
 _LENGTH = 8  # bytes
-_CRC = struct.Struct("<I")
 _BESIDES = {bytes([Opcode.ATTACHMENT]), bytes([Opcode.METADATA])}  # first bytes of such records
 _LAST = 2**63 - 1  # ns
-_PLACES_TOLD = 3
+REMEDY = "`mcap recover` of https://mcap.dev writes what can be read as a file with an index"
 
 _DAMAGE = (
     *(McapError, zstandard.ZstdError, struct.error, RuntimeError),  # the last one of lz4
@@ -59,26 +58,23 @@ _Ordered = tuple[int, int, int, BagMessage]  # log time, offset of the run, plac
 
 
 class McapStorage:
-    """One MCAP file as a Storage; errors call it by the label.
+    """One MCAP file as a Storage.
 
     Raises:
-        BagError: the quality of service of a topic cannot be understood.
+        BagError: it is damaged, or the quality of service of a topic cannot be understood.
     """
 
-    def __init__(self, path: Path, label: str) -> None:
+    def __init__(self, path: Path) -> None:
         self._path = path
-        self._label = label
-        self.faults: list[Fault] = []
+        self.fault = ""
         self.attachments: list[Attachment] = []
-        self.damaged_attachments: list[Fault] = []
         self.notes: list[Metadata] = []
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._counts: Counter[int] = Counter()  # messages by channel
         self._runs: list[_Run] = []
         with path.open("rb") as stream:
-            self.is_indexed = self._read_index(stream)
-            if not self.is_indexed:
+            if not self._read_index(stream):
                 self._walk(stream)
         self._runs.sort()
         self.start = min((run.start for run in self._runs), default=None)
@@ -86,25 +82,19 @@ class McapStorage:
         self.topics = [self._topic(id, channel) for id, channel in self._channels.items()]
 
     def messages(
-        self, topics: Collection[str], damage: list[Fault] | None, since: int | None = None
+        self, topics: Collection[str], damage: list[str] | None, since: int | None
     ) -> Iterator[BagMessage]:
-        """Yield the messages of these topics in the order of their log times.
-
-        Args:
-            topics: their names.
-            damage: takes at the end the faults of chunks that were left out.
-            since: lowest log time, ns, of those that are wanted; None for all.
+        """Yield the messages of these topics, since a log time (ns), in the order of log times.
 
         Raises:
-            BagError: a chunk is damaged, and ``damage`` is None.
+            BagError: a chunk is damaged, and there is no ``damage`` that takes such sentences.
         """
         wanted = {
             id: (channel.topic, _type_name(self._schemas.get(channel.schema_id)))
             for id, channel in self._channels.items()
             if channel.topic in topics
         }
-        broken: list[str] = []
-        read, total = 0, sum(self._counts[id] for id in wanted)
+        broken = ""
         # Chunks overlap in time; a message leaves the heap when no later chunk can precede it.
         # Of messages with the same log time the one that is earlier in the file comes first.
         pending: list[_Ordered] = []
@@ -117,25 +107,20 @@ class McapStorage:
                     yield heapq.heappop(pending)[-1]
                 try:
                     for each in _messages(stream, run, wanted):
-                        read += 1
                         if since is None or each[0] >= since:
                             heapq.heappush(pending, each)
                 except _DAMAGE as error:
-                    broken.append(f"its chunk at byte {run.offset}: {error}")
+                    broken = self._damaged(f"chunk at byte {run.offset}", error)
                     if damage is None:
                         break
+                    damage.append(broken)
         while pending:
             yield heapq.heappop(pending)[-1]
-        is_read_whole = since is None and not (broken and damage is None)
-        lost = total - read if is_read_whole else 0
-        if broken or lost:
-            where = "; ".join(broken[:_PLACES_TOLD]) or "its index"
-            count = f": {lost} of its {total} messages cannot be read" if lost else ""
-            text = f"{self._label} is damaged in {where}{count}"
-            if damage is None:
-                remedy = "`us-sim bag repair` writes all that can be read as a new bag"
-                raise BagError(f"{text}; {remedy}")
-            damage.append(Fault(text, lost))
+        if broken and damage is None:
+            raise BagError(broken)
+
+    def _damaged(self, part: str, error: Exception) -> str:
+        return f"{self._path} is damaged in its {part}: {error}; {REMEDY}"
 
     def _read_index(self, stream: BinaryIO) -> bool:
         """Read the contents by the index; return False where there is no sound one of all."""
@@ -163,12 +148,15 @@ class McapStorage:
             run = _Run(times[0], each.chunk_start_offset, times[1], each.chunk_length, channels)
             self._runs.append(run)
         for offset, record in records.items():
-            self._add(offset, record)
+            try:
+                self._add(offset, record)
+            except _DAMAGE as error:
+                self.fault = self._damaged(f"record at byte {offset}", error)
         return True
 
     def _walk(self, stream: BinaryIO) -> None:
         """Find the contents of a file without an index, up to where it was cut."""
-        position, is_ended = len(MCAP0_MAGIC), False
+        position, is_ended, why = len(MCAP0_MAGIC), False, ""
         size = stream.seek(-len(MCAP0_MAGIC), 2) + len(MCAP0_MAGIC)
         has_magic = stream.read() == MCAP0_MAGIC
         while position + _HEADER.size <= size and not is_ended:
@@ -177,39 +165,39 @@ class McapStorage:
             if end > size or not opcode:  # zeros are what a power cut leaves
                 break
             is_ended = opcode == Opcode.DATA_END
-            self._add(position, _record_at(stream, position, end - position))
+            try:
+                self._add(position, _record_at(stream, position, end - position))
+            except _DAMAGE as error:
+                why = f", and its record at byte {position} is damaged: {error}"
             position = end
-        if not (is_ended and has_magic):
+        if why or not (is_ended and has_magic):
             times = [time for run in self._runs for time in (run.start, run.end)] or [0]
-            text = (
-                f"{self._label} was not ended properly (it breaks off at byte {position} of "
-                f"{size}): {self._counts.total()} messages over "
-                f"{(max(times) - min(times)) / 1e9:.1f} s were recovered"
+            self.fault = (
+                f"{self._path} was not ended properly (it breaks off at byte {position} of "
+                f"{size}{why}): {self._counts.total()} messages over "
+                f"{(max(times) - min(times)) / 1e9:.1f} s were recovered; {REMEDY}"
             )
-            self.faults.append(Fault(text))
 
     def _add(self, offset: int, record: bytes) -> None:
-        """Note what a record holds, or that it is damaged."""
+        """Note what a record holds.
+
+        Raises:
+            _DAMAGE: it is not sound.
+        """
         heads = []
-        try:
-            for opcode, content in _records_in(record):
-                if opcode == Opcode.MESSAGE:
-                    heads.append(_MESSAGE.unpack_from(content))
-                elif opcode == Opcode.SCHEMA:
-                    schema = _parsed(Schema, content)
-                    self._schemas[schema.id] = schema
-                elif opcode == Opcode.CHANNEL:
-                    channel = _parsed(Channel, content)
-                    self._channels[channel.id] = channel
-                elif opcode == Opcode.METADATA:
-                    self.notes.append(_parsed(Metadata, content))
-                elif opcode == Opcode.ATTACHMENT:
-                    self.attachments.append(_attachment(content))
-        except _DAMAGE as error:
-            text = f"{self._label} is damaged in its record at byte {offset}: {error}"
-            is_attachment = record[:1] == bytes([Opcode.ATTACHMENT])
-            (self.damaged_attachments if is_attachment else self.faults).append(Fault(text))
-            return
+        for opcode, content in [*_records_in(record)]:
+            if opcode == Opcode.MESSAGE:
+                heads.append(_MESSAGE.unpack_from(content))
+            elif opcode == Opcode.SCHEMA:
+                schema = _parsed(Schema, content)
+                self._schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                channel = _parsed(Channel, content)
+                self._channels[channel.id] = channel
+            elif opcode == Opcode.METADATA:
+                self.notes.append(_parsed(Metadata, content))
+            elif opcode == Opcode.ATTACHMENT:
+                self.attachments.append(_parsed(Attachment, content))
         if heads:
             times = [time for _, _, time, _ in heads]
             counts = Counter(channel for channel, *_ in heads)
@@ -224,7 +212,7 @@ class McapStorage:
             name=channel.topic,
             type_name=_type_name(schema),
             message_count=self._counts[id],
-            qos=qos_from_yaml(qos, f"{self._label}, {channel.topic}"),
+            qos=qos_from_yaml(qos, f"{self._path}, {channel.topic}"),
             type_hash=channel.metadata.get("topic_type_hash", ""),
             encoding=channel.message_encoding,
             schema=schema.data.decode(errors="replace") if schema and is_text else None,
@@ -236,19 +224,6 @@ def _record_at(stream: BinaryIO, offset: int, length: int) -> bytes:
     size = os.fstat(stream.fileno()).st_size
     stream.seek(min(offset, size))
     return stream.read(min(length, size))
-
-
-def _attachment(content: memoryview) -> Attachment:
-    """Parse an attached file, whose record has a checksum of its own.
-
-    Raises:
-        _DAMAGE: it is not sound.
-    """
-    attachment: Attachment = _parsed(Attachment, content)
-    (crc,) = _CRC.unpack_from(content[-_CRC.size :])
-    if crc and zlib.crc32(content[: -_CRC.size]) != crc:
-        raise ValueError(f"the checksum of {attachment.name} does not match")
-    return attachment
 
 
 def _parsed(kind: Any, content: memoryview) -> Any:

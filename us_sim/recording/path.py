@@ -313,7 +313,7 @@ def _frames(rows: list[Row]) -> list[str]:
 def _usable(bag: Bag, name: str, rows: list[Row]) -> ProbePath:
     """Return the poses of one frame that can be used."""
     if not rows:
-        raise BagError(f"{bag.path} holds no pose on {name}; {bag.note or 'it is silent'}")
+        raise BagError(f"{bag.path} holds no pose on {name}; {bag.fault or 'it is silent'}")
     frames = _frames(rows)
     if len(frames) > 1:
         raise BagError(
@@ -323,7 +323,7 @@ def _usable(bag: Bag, name: str, rows: list[Row]) -> ProbePath:
     poses = np.array([row.pose for row in rows], np.float64)
     usable = is_pose(poses)
     rejected = len(rows) - int(usable.sum())
-    notes = [bag.note] if bag.note else []
+    notes = [bag.fault] if bag.fault else []
     if rejected:
         notes.append(
             f"{rejected} of the {len(rows)} poses on {name} are not finite or have no orientation "

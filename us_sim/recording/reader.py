@@ -1,4 +1,4 @@
-"""Reading bags: MCAP or SQLite, one file or a folder, compressed or not, whole or cut off.
+"""Reading bags: MCAP or SQLite, one file or a folder, whole or cut off.
 
 >>> import tempfile
 >>> from us_sim.recording.reader import read_bag
@@ -14,10 +14,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 from collections import Counter, defaultdict, deque
 from collections.abc import Collection, Iterator
-from dataclasses import replace
 from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any
@@ -29,15 +29,10 @@ from rosbags.typesys.store import Typestore
 
 from us_sim.errors import BagError, printable
 from us_sim.recording import MARKER
-from us_sim.recording.metadata import BagMetadata
+from us_sim.recording.metadata import METADATA, missing_files
 from us_sim.recording.schemas import definitions, jazzy_definitions
-from us_sim.recording.storage import (
-    Storage,
-    bag_files,
-    missing_files,
-    open_storage,
-)
-from us_sim.recording.topic import LOST, BagMessage, BagTopic, Fault
+from us_sim.recording.storage import Storage, bag_files, open_storage
+from us_sim.recording.topic import LOST, BagMessage, BagTopic
 from us_sim.settings.spelling import aligned
 
 
@@ -48,65 +43,30 @@ class Bag:
         start: lowest log time in ns since the epoch; None without messages.
         end: highest log time.
         message_count: on all topics.
-        is_indexed: whether every file of it has an index, so that none is read to open it.
         attachments: the files within it, such as the scene that was recorded, by their names.
-        damaged_attachments: the faults of those that are damaged, and left out.
         notes: the texts that it holds beside its messages.
+        fault: what was found to be wrong when it was opened; empty where nothing was.
     """
 
-    def __init__(self, path: Path, storages: list[Storage], metadata: BagMetadata | None) -> None:
+    def __init__(self, path: Path, storages: list[Storage]) -> None:
         self.path = path
-        self.metadata = metadata
         self._storages = storages
-        self._is_packed = metadata is not None and metadata.compression_mode == "MESSAGE"
         topics: dict[str, BagTopic] = {}
         for topic in (topic for storage in storages for topic in storage.topics):
             earlier = topics.get(topic.name)
             topics[topic.name] = earlier.joined(topic, str(path)) if earlier else topic
-        for entry in metadata.topics if metadata else ():
-            topics.setdefault(entry.name, replace(entry, message_count=0))
         self.topics = tuple(topics.values())
         self._topics = topics
         starts, ends = [each.start for each in storages], [each.end for each in storages]
         self.start = min((time for time in starts if time is not None), default=None)
         self.end = max((time for time in ends if time is not None), default=None)
         self.message_count = sum(topic.message_count for topic in self.topics)
-        self.is_indexed = all(storage.is_indexed for storage in storages)
         self.attachments = {each.name: each for storage in storages for each in storage.attachments}
-        self.damaged_attachments = [f for storage in storages for f in storage.damaged_attachments]
         self.notes = [note for storage in storages for note in storage.notes]
-
-    @property
-    def note(self) -> str:
-        """Return the faults that were found when the bag was opened; empty when there are none."""
-        return "; ".join(fault.text for fault in self.opening_faults)
-
-    @property
-    def opening_faults(self) -> list[Fault]:
-        """Return the faults that were found when the bag was opened."""
-        found = [fault for storage in self._storages for fault in storage.faults]
-        found += self.damaged_attachments
-        if self.metadata is not None:
-            if missing := ", ".join(missing_files(self.path, self.metadata)):
-                text = f"{self.path / 'metadata.yaml'} names files that are not there: {missing}"
-                found.append(Fault(text))
-            if lost := self.metadata.message_count - self.message_count:
-                text = (
-                    f"{self.path} has {self.message_count} messages where its metadata.yaml says "
-                    f"{self.metadata.message_count}: "
-                    f"{f'{lost} were lost' if lost > 0 else 'more were written since'}"
-                )
-                untold = max(lost - sum(fault.messages for fault in found), 0)
-                found.append(Fault(text, untold))
-        return found
-
-    def all_messages(self, faults: list[Fault]) -> Iterator[BagMessage]:
-        """Yield every message that can be read; ``faults`` takes everything that is wrong."""
-        faults += self.opening_faults
-        try:
-            yield from self.messages(damage=faults)
-        except BagError as error:
-            faults.append(Fault(str(error)))
+        faults = [storage.fault for storage in storages if storage.fault]
+        if missing := missing_files(path):
+            faults.append(f"{path / METADATA} names files that are not there: {', '.join(missing)}")
+        self.fault = "; ".join(faults)
 
     def topic(self, name: str) -> BagTopic:
         """Return the topic of this name, with or without its leading slash.
@@ -124,8 +84,7 @@ class Bag:
     def markers(self) -> list[tuple[int, str]]:
         """Return the moments that a person marked: ns since the epoch, and the text."""
         topics = [each.name for each in self.topics if each.name.endswith(f"/{MARKER}")]
-        messages = self.messages(topics, [])
-        return [(each.log_time, self.deserialize(each).data) for each in messages]
+        return [(each.log_time, self.deserialize(each).data) for each in self.messages(topics, [])]
 
     def lost(self) -> Counter[str]:
         """Count the messages that the recorder says that it lost, by topic."""
@@ -135,17 +94,25 @@ class Bag:
                 lost.update({topic: _count(text) for topic, text in note.metadata.items()})
         return lost
 
+    def all_messages(self, faults: list[str]) -> Iterator[BagMessage]:
+        """Yield every message that can be read; ``faults`` takes everything that is wrong."""
+        faults += [self.fault] if self.fault else []
+        try:
+            yield from self.messages(damage=faults)
+        except BagError as error:
+            faults.append(str(error))
+
     def messages(
         self,
         topics: Collection[str] | None = None,
-        damage: list[Fault] | None = None,
+        damage: list[str] | None = None,
         since: int | None = None,
     ) -> Iterator[BagMessage]:
         """Yield the messages of all topics or of these, in the order of their log times.
 
         Args:
             topics: their names; None for all.
-            damage: takes the faults of damaged parts, which are then left out.
+            damage: takes a sentence for each damaged part, which is then left out.
             since: the lowest log time of those that are wanted, ns; what is before is not read
                 where there is an index. None for all.
 
@@ -153,15 +120,8 @@ class Bag:
             BagError: the bag has no such topic, or is damaged and ``damage`` is None.
         """
         names = {self.topic(name).name for name in topics} if topics is not None else self._topics
-        packed = 0
         streams = [storage.messages(names, damage, since) for storage in self._storages]
-        for message in heapq.merge(*streams, key=lambda message: message.log_time):
-            unpacked = self._unpacked(message)
-            packed += unpacked is not message
-            yield unpacked
-        if packed and damage is not None and not self._is_packed:
-            text = f"{packed} messages of {self.path} are each packed with zstd"
-            damage.append(Fault(f"{text}, which no metadata.yaml says"))
+        yield from map(_unpacked, heapq.merge(*streams, key=lambda message: message.log_time))
 
     def latest(self, topics: Collection[str], before: int, count: int = 1) -> list[BagMessage]:
         """Return the last messages of each topic before a time, in the order of log times.
@@ -178,23 +138,6 @@ class Bag:
         for message in takewhile(lambda each: each.log_time < before, self.messages(topics, [])):
             last[message.topic].append(message)
         return sorted(chain(*last.values()), key=lambda message: message.log_time)
-
-    def _unpacked(self, message: BagMessage) -> BagMessage:
-        """Return the message, decompressed where each one is compressed by itself.
-
-        Without metadata.yaml a frame of zstd is known by its first bytes: no CDR has them.
-        """
-        is_frame = message.data.startswith(zstandard.FRAME_HEADER)
-        is_cdr = self._topics[message.topic].encoding == "cdr"
-        if not (self._is_packed or (is_frame and is_cdr)):
-            return message
-        try:
-            data = zstandard.decompress(message.data)
-        except zstandard.ZstdError as error:
-            if self._is_packed:
-                raise BagError(f"{self.path} is damaged: {error}") from None
-            return message  # other bytes that begin so
-        return message._replace(data=data)
 
     def deserialize(self, message: BagMessage) -> Any:
         """Return the message as a rosbags dataclass, by the definition that the bag carries.
@@ -237,6 +180,17 @@ class Bag:
         return store
 
 
+def _unpacked(message: BagMessage) -> BagMessage:
+    """Return the message, unpacked where rosbag2 compressed each one by itself.
+
+    A frame of zstd is known by its first bytes, which no CDR has.
+    """
+    if message.data.startswith(zstandard.FRAME_HEADER):
+        with contextlib.suppress(zstandard.ZstdError):
+            return message._replace(data=zstandard.decompress(message.data))
+    return message
+
+
 def _count(text: str) -> int:
     """Return the number that a note holds; 0 for any other text."""
     return int(text) if text.isascii() and text.isdecimal() and len(text) < 20 else 0
@@ -246,8 +200,7 @@ def read_bag(path: str | Path, *further: Path) -> Bag:
     """Open a bag for reading.
 
     Args:
-        path: an MCAP or SQLite file, either of them compressed with zstd, or a folder with such
-            files, with or without their ``metadata.yaml``.
+        path: an MCAP or SQLite file, or a folder with those of one bag.
         further: files in which the recording goes on.
 
     Raises:
@@ -255,8 +208,7 @@ def read_bag(path: str | Path, *further: Path) -> Bag:
     """
     path = Path(path)
     try:
-        files, metadata = bag_files(path)
-        return Bag(path, [open_storage(file) for file in (*files, *further)], metadata)
+        return Bag(path, [open_storage(file) for file in (*bag_files(path), *further)])
     except OSError as error:
         raise BagError(f"{path} cannot be read: {error.strerror or error}") from None
 
@@ -266,14 +218,14 @@ def describe(bag: Bag) -> str:
 
     The times of marks are those since the start. All of the bag is read, for its faults.
     """
-    start, faults = bag.start, list[Fault]()
+    start, faults = bag.start, list[str]()
     times: dict[str, tuple[int, int]] = {}  # ns, first and last of a topic
     for message in bag.all_messages(faults):
         first, _ = times.get(message.topic, (message.log_time, 0))
         times[message.topic] = first, message.log_time
     seconds = (bag.end - start) * 1e-9 if start is not None and bag.end is not None else 0.0
     lines = [f"file      {bag.path}"]
-    lines += [f"note      {fault.text}" for fault in faults]
+    lines += [f"note      {fault}" for fault in faults]
     if start is not None:
         lines.append(f"start     {np.datetime64(start, 'ns').astype('datetime64[ms]')}+00:00")
     lines += [f"duration  {seconds:.3f} s", f"messages  {bag.message_count}", ""]

@@ -132,10 +132,3 @@ class BagMessage(NamedTuple):
     publish_time: int  # ns since the epoch, when it was sent; the log time where none is kept
     data: bytes
     sequence: int = 0  # its number on its topic; 0 where none is kept
-
-
-class Fault(NamedTuple):
-    """Something that is wrong with a bag."""
-
-    text: str  # a sentence
-    messages: int = 0  # that are lost by it, as far as is known

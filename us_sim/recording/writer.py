@@ -26,7 +26,8 @@ from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Qos
 
 from us_sim.errors import BagError
-from us_sim.recording.metadata import NO_TIME, BagMetadata
+from us_sim.recording.mcap_storage import REMEDY
+from us_sim.recording.metadata import INFORMATION, METADATA, NO_TIME, bag_information
 from us_sim.recording.schemas import definitions, schema_text
 from us_sim.recording.topic import BagTopic, as_yaml, qos_to_yaml
 from us_sim.settings.spelling import counted
@@ -174,7 +175,6 @@ class BagWriter:
         type_hash: str | None = None,
         *,
         schema: str | None = None,
-        defined: bool = True,
     ) -> None:
         """Make a topic known; adding it again with the same type adds its quality of service.
 
@@ -184,7 +184,6 @@ class BagWriter:
             qos: offered by its publishers. Later profiles are in ``metadata.yaml`` alone.
             type_hash: RIHS01 hash; computed from the definition by default.
             schema: ``ros2msg`` text; the installed or the Jazzy definition by default.
-            defined: False takes a type whose definition is not known, and writes none.
 
         Raises:
             BagError: the type is unknown, differs from before, or the bag is closed.
@@ -201,24 +200,16 @@ class BagWriter:
             qualities = tuple(dict.fromkeys((*known.qos, *profiles)))
             self._topics[topic] = replace(known, qos=qualities)
             return
-        try:
-            schema = schema_text(type_name) if schema is None else schema
-            if type_hash is None:
-                type_hash = definitions(type_name, schema).hash_rihs01(type_name)
-        except BagError:
-            if defined:
-                raise
+        schema = schema_text(type_name) if schema is None else schema
+        if type_hash is None:
+            type_hash = definitions(type_name, schema).hash_rihs01(type_name)
         if type_name not in self._schemas:
-            encoding = "" if schema is None else "ros2msg"
-            content = (schema or "").encode()
-            self._schemas[type_name] = self._writer.register_schema(type_name, encoding, content)
-        about = {
-            "offered_qos_profiles": qos_to_yaml(profiles),
-            "topic_type_hash": type_hash or "",
-        }
+            content = schema.encode()
+            self._schemas[type_name] = self._writer.register_schema(type_name, "ros2msg", content)
+        about = {"offered_qos_profiles": qos_to_yaml(profiles), "topic_type_hash": type_hash}
         schema_id = self._schemas[type_name]
         self._channels[topic] = self._writer.register_channel(topic, "cdr", schema_id, about)
-        self._topics[topic] = BagTopic(topic, type_name, 0, profiles, type_hash or "")
+        self._topics[topic] = BagTopic(topic, type_name, 0, profiles, type_hash)
 
     def write(
         self,
@@ -308,10 +299,7 @@ class BagWriter:
         self._file.close()
         problems = []
         if self.problem:
-            problems.append(
-                f"{self._full()}; what came since and its index are missing, and `us-sim bag "
-                f"repair` makes an index where there is room"
-            )
+            problems.append(f"{self._full()}; what came since and its index are missing: {REMEDY}")
         self._is_closed = True
         if not self.path.exists():
             problems.append(
@@ -321,14 +309,13 @@ class BagWriter:
         elif self._metadata_file is not None:
             try:
                 with self._metadata_file.open("x", encoding="utf-8") as file:
-                    file.write(self._metadata().document())
+                    file.write(as_yaml({INFORMATION: self._information()}))
             except OSError as error:
                 if not isinstance(error, FileExistsError):
                     self._metadata_file.unlink(missing_ok=True)
                 problems.append(
                     f"{self._metadata_file} cannot be written ({error.strerror}): the recording "
-                    f"can be read without it, and `us-sim bag repair {self.path.parent}` makes a "
-                    f"bag that has it"
+                    f"can be read without it, and `ros2 bag reindex {self.path.parent}` writes it"
                 )
         if problems:
             raise BagError("; ".join(problems))
@@ -348,16 +335,16 @@ class BagWriter:
         return f"{self.path} cannot be written ({self._file.error.strerror})"
 
     def _add_metadata(self) -> None:
-        information = as_yaml(self._metadata().information())
-        self._writer.add_metadata("rosbag2", {"serialized_metadata": information})
+        information = {"serialized_metadata": as_yaml(self._information())}
+        self._writer.add_metadata("rosbag2", information)
         self._writer.flush()
 
-    def _metadata(self) -> BagMetadata:
-        topics = tuple(
+    def _information(self) -> dict[str, Any]:
+        topics = [
             replace(topic, message_count=self._counts[name]) for name, topic in self._topics.items()
-        )
-        extent = self._start, max(self._end - self._start, 0)
-        return BagMetadata((self.path.name,), topics, *extent, self.message_count)
+        ]
+        duration = max(self._end - self._start, 0)
+        return bag_information(self.path.name, topics, self._start, duration)
 
 
 def _names(path: Path, sidecar: bool, further: bool) -> tuple[Path, Path | None]:
@@ -374,7 +361,7 @@ def _names(path: Path, sidecar: bool, further: bool) -> tuple[Path, Path | None]
         raise BagError(f"{path} exists already and is not empty: choose another name")
     if not sidecar:
         return file, None
-    metadata_file = file.with_name("metadata.yaml")
+    metadata_file = file.with_name(METADATA)
     if metadata_file.exists():
         raise BagError(
             f"{metadata_file} belongs to another recording: record into a folder of its own, such "

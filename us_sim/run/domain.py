@@ -71,9 +71,7 @@ def enclave_of(node: str) -> str:
 
 @contextlib.contextmanager
 def alone_on_domain(space: str | None = None) -> Iterator[None]:
-    """Have the domain to oneself, as far as simulations in a namespace and on this host go.
-
-    Without ``space`` that is the namespace of ``--ros-args``.
+    """Have the domain to oneself, in a namespace (that of ``--ros-args``) and on this host.
 
     Raises:
         UsSimError: another simulation has it.

@@ -114,8 +114,6 @@ def _status(plan: Plan, monitor: SessionMonitor) -> str:
         told.append(f"{player['played']} of {plan.poses} played")
     elif player.get("state") == "playing":
         told.append(f"{player.get('position')} of {player.get('duration')} s played")
-    if plan.loops:
-        told.append("begins again at its end")
     if images := monitor.count(IMAGER, IMAGES):
         latency, rate = slicer.get("latency_p99_ms", "?"), slicer.get("rate_hz", "?")
         told.append(f"{images} images, {rate}/s, p99 latency {latency} ms")
@@ -239,7 +237,7 @@ def play(bag: Path, player: PlayerSettings, *, topic: str, everything: bool, loc
     else:
         poses = len(read_path(bag, topic or None, option="--topic"))
         process = NodeProcess("path_player", settings | {"topic": topic, "lockstep": lockstep})
-    plan = Plan([process], poses, player=process.node, loops=player.loop)
+    plan = Plan([process], poses, player=process.node)
     return _require_nothing_lost(follow(plan, None, SupervisionSettings()))
 
 
@@ -255,7 +253,8 @@ def _report(scene: Scene, out: Path, outcome: Outcome, wall: float) -> None:
 
     with Progress("measuring the recording", 100, "%") as bar:
         session = read_session(*outcome.files)
-        areas = session.lumen_areas(scene, 120, lambda done: bar.update(50 * done))
+        meter = session.measure_lumens(scene, 120, lambda done: bar.update(50 * done))
+        areas = meter.areas() if meter is not None else None
         summary = session.summary(areas)
         summary |= {"scene": scene.name, "startup_s": round(outcome.startup, 2)}
         summary |= {"wall_s": round(wall, 2), "lost": list(outcome.losses)}

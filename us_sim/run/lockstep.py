@@ -148,7 +148,6 @@ def _spin(
         if player.finished.done() and silence > QUIET_S and is_complete:
             return int(images)
         if silence > 60.0:
-            what = "image" if is_complete else f"{' or '.join(truth)} of each image"
             raise UsSimError(
-                f"no {what} came for pose {images} in a minute; the path is rendered up to it"
+                f"pose {images} was not answered in full in a minute; the path is rendered up to it"
             )

@@ -104,7 +104,6 @@ class Plan:
     poses: int | None = None  # or images, in the path that is played to its end
     duration: float | None = None  # s
     player: str = "path_player"  # node that plays them
-    loops: bool = False  # it begins again at its end
     topic: str | None = None  # of the body in the path that is played
 
     @property
@@ -214,8 +213,7 @@ def plan_of(request: Request) -> Plan:
     poses = None if settings.get("stay") else len(path)
     settings |= player
     processes.append(NodeProcess("path_player", settings))
-    loops = bool(settings.get("loop"))
-    return Plan(processes, poses, request.duration, loops=loops, topic=path.topic)
+    return Plan(processes, poses, request.duration, topic=path.topic)
 
 
 def viewer_process(view: ViewerSettings, given: dict[str, object] | None = None) -> NodeProcess:

@@ -17,7 +17,7 @@ from us_sim.nodes.settings import AnnotatedImageSettings
 from us_sim.nodes.topics import TOPICS
 from us_sim.recording.reader import Bag
 from us_sim.recording.stamps import stamp_reader
-from us_sim.recording.topic import BagTopic, Fault
+from us_sim.recording.topic import BagTopic
 from us_sim.run.session_tables import SECOND, Progress, read_times
 from us_sim.settings.spelling import aligned, counted
 
@@ -82,7 +82,7 @@ class TopicCheck:
         is_numbered: bool,
     ) -> None:
         self.topic, self.messages, self._poses = topic, messages, poses
-        self._start, self._is_cut = bag.start or 0, bool(bag.opening_faults)
+        self._start, self._is_cut = bag.start or 0, bool(bag.fault)
         self._is_timed = stamp_reader(bag, topic) is not None and not topic.is_latched
         self.findings: list[Finding] = []
         self.missing = self._check_numbers(bag.lost()[topic.name], is_numbered)
@@ -220,7 +220,7 @@ class TopicCheck:
 
 def check(bag: Bag, progress: Progress = lambda *_: None) -> BagCheck:
     """Read all of a bag, of a session or of anything else, and judge it."""
-    faults: list[Fault] = []
+    faults: list[str] = []
     tables = read_times(bag, None, faults, progress)
     heard = {name: table for name, table in tables.items() if len(table)}
     is_numbered = len(heard) < 2 or not pd.concat(heard)["number"].is_unique  # not all together
@@ -230,17 +230,12 @@ def check(bag: Bag, progress: Progress = lambda *_: None) -> BagCheck:
         poses = heard.get(f"{topic.name.removesuffix(derived)}{POSES}") if derived else None
         topics.append(TopicCheck(bag, topic, tables[topic.name], poses, is_numbered))
     findings = [finding for each in topics for finding in each.findings]
-    damaged = sum(fault.messages for fault in faults)
-    if damaged > 0 and sum(each.missing or 0 for each in topics) <= damaged:
-        # The damaged parts held what is missing, and the poses of these stamps.
+    if faults:
+        # The damaged parts may have held what is missing, and the poses of these stamps.
         findings = [finding for finding in findings if finding.kind not in ("loss", "stamp")]
-    remedy = f"`us-sim bag repair {bag.path}` writes all that can be read as a new bag"
-    told = [f"{fault.text}: {remedy}" for fault in faults]
-    if not bag.is_indexed and not faults:
-        told.append(f"{bag.path} has no sound index, so that it is read whole: {remedy}")
     if not bag.message_count:
-        told.append(f"{bag.path} holds no message: record again")
-    return BagCheck(bag, topics, [*(Finding("index", text) for text in told), *findings])
+        faults.append(f"{bag.path} holds no message: record again")
+    return BagCheck(bag, topics, [*(Finding("index", text) for text in faults), *findings])
 
 
 def report(found: BagCheck) -> str:

@@ -13,9 +13,9 @@ import pandas as pd
 from PIL import Image
 
 from us_sim.errors import BagError, TrackingError
+from us_sim.recording.attached_files import new_file
 from us_sim.recording.decoding import affine_from
 from us_sim.recording.reader import Bag
-from us_sim.recording.repair import new_file
 from us_sim.run.session_lerobot import PIXELS
 from us_sim.run.session_summary import read_session, scene_of
 from us_sim.run.session_tables import (
@@ -115,7 +115,8 @@ def _write_areas(bag: Bag, folder: Path, progress: Progress) -> Path:
     """Write areas of vessels in the image plane, now and in the same plane of tissue at rest."""
     with scene_of(bag) as scene:
         session = read_session(bag.path)
-        areas = session.lumen_areas(scene, AREAS, lambda done: progress(done, "areas"))
+        meter = session.measure_lumens(scene, AREAS, lambda done: progress(done, "areas"))
+    areas = meter.areas() if meter is not None else None
     if areas is None:
         raise BagError(f"{bag.path}: no image of it cuts a vessel that can be measured")
     first = min(session.poses)

@@ -153,13 +153,9 @@ class Track:
         """Say what became of its messages, in numbers."""
         if self.is_image:
             shown = self.latest(moments)
-            count = len(np.unique(shown))
             oldest = (moments - self.times[shown]).max() / SECOND
-            told = (
-                f"{count} of {counted(len(self.times), 'image')} shown, "
-                f"{counted(len(moments) - count, 'frame repeats', 'frames repeat')} the one "
-                f"before, which is {oldest:.3f} s old at most"
-            )
+            images = f"{len(np.unique(shown))} of {counted(len(self.times), 'image')}"
+            told = f"{images} shown, which are {oldest:.3f} s old at most"
         else:
             between = "slerp" if self.turns else "linear"
             messages, gap = counted(len(self.times), "message"), np.diff(self.times).max() / SECOND
@@ -190,7 +186,7 @@ class Episode:
         by_log_time: bool = False,
     ) -> None:
         self._bag, self._by_log_time = bag, by_log_time
-        self._left_out = [fault.text for fault in bag.opening_faults]
+        self._left_out = [bag.fault] if bag.fault else []
         self._left_out += [f"the recorder lost {n} of {name}" for name, n in bag.lost().items()]
         self._actions = [whole_name(bag, action)] if action else []
         named = [whole_name(bag, name) for name in topics] + self._actions

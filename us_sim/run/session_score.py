@@ -112,7 +112,7 @@ def _measure_vessels(bag: Bag, path: ProbePath, progress: Progress) -> dict[str,
         session = read_session(bag.path)
         samples = max(_SAMPLES, int(_RATE * path.duration))
         lines, thrombi = vessels_in(volume_of(scene))
-        meter = session.measured_lumens(scene, samples, lambda part: progress(part, "areas"), lines)
+        meter = session.measure_lumens(scene, samples, lambda part: progress(part, "areas"), lines)
     return {
         "sections": meter.sections() if meter is not None else {},
         "lines": lines,

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.sessions.attachments import checksum
+from us_sim.recording.attached_files import extract
 from us_sim.recording.decoding import pixels_from, pose_from, tetrahedra_from, vectors_from
 from us_sim.recording.reader import Bag, read_bag
-from us_sim.recording.repair import extract
 from us_sim.run.session_tables import SECOND, read_times
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.reading import load_scene
@@ -58,21 +58,16 @@ class Session:
             if stamp in stamps
         }
 
-    def lumen_areas(
-        self, scene: Scene, samples: int, progress: Callable[[float], None] = lambda _: None
-    ) -> LumenAreas | None:
-        """Measure vessels at up to ``samples`` images; None without labels or tissue."""
-        meter = self.measured_lumens(scene, samples, progress)
-        return meter.areas() if meter is not None else None
-
-    def measured_lumens(
+    def measure_lumens(
         self,
         scene: Scene,
         samples: int,
         progress: Callable[[float], None] = lambda _: None,
         lines: Mapping[str, CentreLine] | None = None,
     ) -> LumenMeter | None:
-        """Measure likewise, with centre lines of the vessels for their places.
+        """Measure vessels at up to ``samples`` images, and where they are along centre lines.
+
+        There is None without labels or tissue.
 
         Raises:
             BagError: no image has its pose and nodes.

@@ -16,12 +16,11 @@ import numpy as np
 import pandas as pd
 
 from us_sim.errors import BagError
+from us_sim.recording.attached_files import new_file
 from us_sim.recording.lerobot_writer import POSE_PARTS, WRENCH_PARTS
 from us_sim.recording.path import POSE_STAMPED, bodies_in, pose_rows
 from us_sim.recording.reader import Bag
-from us_sim.recording.repair import new_file
 from us_sim.recording.stamps import stamp_reader
-from us_sim.recording.topic import Fault
 
 SECOND = 1_000_000_000  # ns
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
@@ -34,7 +33,7 @@ Progress = Callable[[float, str], None]
 def read_times(
     bag: Bag,
     topics: Collection[str] | None = None,
-    faults: list[Fault] | None = None,
+    faults: list[str] | None = None,
     progress: Progress = lambda *_: None,
 ) -> dict[str, pd.DataFrame]:
     """Read when messages were stamped, sent and logged, their numbers and sizes, by topic.

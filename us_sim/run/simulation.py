@@ -19,7 +19,7 @@ from us_sim.scene.reading import check_files, load_scene
 from us_sim.share import find_bag, full_path, shared_roots
 
 _BAGS_EVERY_S = 2.0
-_BAGS = (".mcap", ".db3", ".zstd")
+_BAGS = (".mcap", ".db3")
 _MOST_BAGS = 500  # the newest
 _OF_SCENE = {"scene", "volume"}
 _OF_RECORDER = ("state", "note", "seconds", "bytes", "room_bytes")  # values of its report

@@ -13,7 +13,7 @@ import yaml
 
 from us_sim.errors import BagError, UsSimError
 from us_sim.nodes.settings import SessionRecorderSettings
-from us_sim.recording.repair import versions
+from us_sim.recording.attached_files import versions
 from us_sim.recording.storage import bag_files
 from us_sim.scene.reading import parse_scene, scene_document, with_path, with_volume
 from us_sim.settings.setting import rules_of
@@ -87,10 +87,9 @@ def parts_of(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
     try:
-        files, metadata = bag_files(path)
+        return bag_files(path)
     except (BagError, OSError):
         return sorted(file for file in path.rglob("*") if file.is_file())
-    return [*files, path / "metadata.yaml"] if metadata else files
 
 
 def _attach(attached: dict[str, tuple[str, bytes]], path: Path, name: str = "") -> bool:

@@ -17,7 +17,6 @@ from us_sim.nodes.messages import stamp_message
 from us_sim.nodes.parameters import LiveSettings
 from us_sim.nodes.settings import PlayerSettings
 from us_sim.recording.playhead import Playhead
-from us_sim.recording.topic import Fault
 from us_sim.share import find_bag
 
 
@@ -44,7 +43,7 @@ class Player(GuardedNode):
         self.head = Playhead(chosen.rate)
         self.first = self.length = 0  # ns: since 1970 when it was recorded, and how long it is
         self.gap = 0  # ns, from its end to its start where it loops
-        self.damage: list[Fault] = []  # found so far
+        self.damage: list[str] = []  # found so far
         self.has_begun = self._is_stopped = False
         self._latest = 0  # ns, of `now`
         self.clock = Clock() if chosen.clock else self.get_clock()
@@ -146,7 +145,7 @@ class Player(GuardedNode):
         if self.settings.stay:
             return
         if self.damage:
-            text = f"not all of the recording was played: {self.damage[0].text}"
+            text = f"not all of the recording was played: {self.damage[0]}"
             self.finished.set_exception(BagError(text))
         else:
             self.finished.set_result(None)
