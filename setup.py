@@ -1,10 +1,10 @@
-"""Package `us_sim` for pip (one command, `us-sim`) and for colcon (one executable a node)."""
+"""What differs between pip (one command, `us-sim`) and colcon (one executable a node)."""
 
 import os
 import sys
 from pathlib import Path
 
-from setuptools import find_packages, setup
+from setuptools import setup
 
 NODES = [
     "nodes.camera_driver",
@@ -27,8 +27,6 @@ FOLDER = Path(__file__).resolve().parent
 BY_COLCON = bool({"install", "develop"} & set(sys.argv))
 """colcon calls `setup.py install` or `setup.py develop`; pip builds a wheel."""
 
-GYMNASIUM = "gymnasium>=1.1,<2"
-UPATH = "universal-pathlib>=0.3"
 HAS_ROS_WHEELS = "platform_system == 'Linux' and platform_machine == 'x86_64'"
 ROS = [
     f"ros-jazzy-rclpy[fastrtps]>=7.1.6,<7.2; {HAS_ROS_WHEELS}",
@@ -58,21 +56,8 @@ def shared_files(folder: str) -> list[tuple[str, list[str]]]:
 
 
 setup(
-    name="us_sim",
-    version="0.1.0",
-    description="Interactive simulation of compression ultrasonography as a ROS 2 node graph",
-    long_description=(FOLDER / "README.md").read_text(encoding="utf-8"),
-    long_description_content_type="text/markdown",
-    license="Apache-2.0",
-    author="us_sim developers",
-    packages=find_packages(include=["us_sim", "us_sim.*"]),
-    package_data={
-        "us_sim.environment": ["*.md"],
-        "us_sim.evaluation": ["*/*.md"],
-        "us_sim.nodes": ["*.yaml"],
-        "us_sim.viewer": ["assets/**/*", "panels/*.js"],
-    },
-    python_requires=">=3.11",
+    license="Apache-2.0",  # in pyproject.toml no form suits both setuptools 68 and 77
+    python_requires=">=3.11",  # read from there, colcon would fail on it
     install_requires=[  # .ci/ubuntu tests the versions of Ubuntu 24.04, which are the oldest here
         *ROS,
         "matplotlib>=3.6.3",
@@ -96,56 +81,12 @@ setup(
         "tqdm>=4.66",
         "zstandard>=0.22",
     ],
-    extras_require={
-        "baselines": [GYMNASIUM, "stable-baselines3>=2.6"],
-        "dicom": [
-            "pillow>=10",
-            "pydicom>=3.0",
-            "pylibjpeg>=2.0",
-            "pylibjpeg-openjpeg>=2.2",
-            "python-gdcm>=3.0.20",
-        ],
-        "environment": [GYMNASIUM],
-        "evaluate": ["scikit-fem>=10", "vtk>=9.4"],
-        "lerobot": ["lerobot[dataset]>=0.4"],
-        "meshes": ["meshio>=5.3"],
-        "ray": [GYMNASIUM, "ray>=2.40", UPATH],
-        "space_mouse": ["hidapi>=0.14"],
-        "viewer": ["nicegui>=3.6,<4"],
-        "test": [
-            "axe-playwright-python>=0.1.4",
-            GYMNASIUM,
-            "hypothesis>=6.100",
-            "meshio>=5.3",
-            "mypy>=1.10",
-            "nicegui>=3.6,<4",
-            "pillow>=10",
-            "playwright>=1.45",
-            "pydicom>=3.0",
-            "pyigtl>=0.3.1",
-            "pylibjpeg>=2.0",
-            "pylibjpeg-openjpeg>=2.2",
-            "pytest>=7.4",
-            "pytest-timeout>=2.2",
-            "pytest-xdist>=3.6",
-            "python-gdcm>=3.0.20",
-            "ruff>=0.12",
-            "scikit-fem>=10",
-            "types-PyYAML",
-            "types-tqdm",
-            UPATH,
-            "vtk>=9.4",
-        ],
-    },
-    data_files=[
+    data_files=[  # which `colcon build --symlink-install` links beside setup.py: all that it reads
         ("share/ament_index/resource_index/packages", ["resource/us_sim"]),
-        ("share/us_sim", ["package.xml"]),
+        ("share/us_sim", ["package.xml", "pyproject.toml", "README.md"]),
         *shared_files("launch"),
         *shared_files("config"),
         *shared_files("bags"),
     ],
-    entry_points={
-        "console_scripts": console_scripts(),
-    },
-    zip_safe=False,
+    entry_points={"console_scripts": console_scripts()},
 )

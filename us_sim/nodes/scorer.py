@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
-from importlib.metadata import version
 from io import BytesIO
 from typing import Any
 
@@ -19,6 +18,7 @@ from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import parameter_value_to_python
 from sensor_msgs.msg import CompressedImage, Image
 
+from us_sim import __version__
 from us_sim.errors import ScoreError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.parameters import LiveSettings, declared
@@ -192,7 +192,7 @@ class Scorer(SceneNode):
             "volume": self.scene.volume.name,
             "method": tissue.solver if tissue is not None else "none",
             "changed": "; ".join(self._changes),
-            "us_sim": version("us_sim"),
+            "us_sim": __version__,
         }
         plain = plain_metrics(score, self._limits.force_limit)
         faults = [{"seconds": round(each.time, 1), "what": each.what} for each in score.faults]

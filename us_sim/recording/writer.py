@@ -17,7 +17,6 @@ import tempfile
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError, version
 from itertools import count
 from pathlib import Path
 from typing import Any, Literal
@@ -25,6 +24,7 @@ from typing import Any, Literal
 from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Qos
 
+from us_sim import __version__
 from us_sim.errors import BagError
 from us_sim.recording.mcap_storage import REMEDY
 from us_sim.recording.metadata import INFORMATION, METADATA, NO_TIME, bag_information
@@ -147,7 +147,7 @@ class BagWriter:
             raise _cannot_be_made(path, error) from None
         stream: Any = self._file  # which has what a Writer asks of one
         self._writer = Writer(stream, chunk_size, _COMPRESSIONS[compression])
-        self._writer.start("ros2", _library())
+        self._writer.start("ros2", f"us_sim {__version__}")
         # rosbag2 does this too: readers find the distribution even in a file that is cut.
         self._add_metadata()
         if self._file.error is not None:
@@ -372,10 +372,3 @@ def _names(path: Path, sidecar: bool, further: bool) -> tuple[Path, Path | None]
 
 def _cannot_be_made(path: str | Path, error: OSError | ValueError) -> BagError:
     return BagError(f"{path} cannot be made: {getattr(error, 'strerror', None) or error}")
-
-
-def _library() -> str:
-    try:
-        return f"us_sim {version('us_sim')}"
-    except PackageNotFoundError:
-        return "us_sim"
