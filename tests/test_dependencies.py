@@ -6,7 +6,6 @@ import importlib
 import inspect
 import re
 import runpy
-import shlex
 import sys
 import tomllib
 from pathlib import Path
@@ -16,10 +15,12 @@ import cv2
 import pytest
 from packaging.requirements import Requirement
 
+import us_sim
 from us_sim.errors import TrackingError
 from us_sim.tracking.camera.markers import dictionary
 
 ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ElementTree.parse(ROOT / "package.xml")
 LIBRARIES = ("cv2", "matplotlib", "numpy", "scipy", "skimage", "tqdm", "yaml")
 """Those that a distribution has in versions of its own."""
 APT = {"opencv": "opencv-python-headless", "skimage": "scikit-image", "yaml": "pyyaml"}
@@ -136,15 +137,18 @@ def test_pip_brings_ros_where_it_can_and_none_is_sourced(set_up, monkeypatch):
     assert numpy.startswith("numpy<2;")  # with which the messages of Ubuntu's packages work
 
 
-def test_a_workspace_of_ros_has_all_that_it_asks_for(set_up):
-    workspace = {plain(each) for each in set_up("install")["install_requires"]}
-    page = (ROOT / "docs" / "ros2.md").read_text(encoding="utf-8")
-    (line,) = re.findall(r"^pip install --break-system-packages (.*)$", page, re.MULTILINE)
-    pip = {plain(each) for each in shlex.split(line)}
-    names = [each.text for each in ElementTree.parse(ROOT / "package.xml").iter("exec_depend")]
+def test_a_workspace_of_ros_has_what_it_asks_for_and_no_more(set_up):
+    asked = {plain(each) for each in set_up("install")["install_requires"]}
+    lines = (ROOT / ".ci" / "requirements-ubuntu.txt").read_text(encoding="utf-8").splitlines()
+    pip = {plain(line) for line in lines if not line.startswith("#")}
+    names = (each.text for each in PACKAGE.iter("exec_depend"))
     apt = {name.removeprefix("python3-") for name in names if name.startswith("python3-")}
-    assert workspace <= pip | {APT.get(name, name) for name in apt}
+    assert asked == pip | {APT.get(name, name) for name in apt}
     assert "opencv-python-headless" in pip  # apt's is too old for markers
+
+
+def test_ros_knows_the_version_of_the_package():
+    assert PACKAGE.findtext("version") == us_sim.__version__
 
 
 def test_so_has_an_environment_of_robostack(set_up):
@@ -154,7 +158,7 @@ def test_so_has_an_environment_of_robostack(set_up):
     found["opencv-python-headless"] = found.pop("opencv")
     found["matplotlib"] = found.pop("matplotlib-base")
     assert {name: found[name].partition(",")[0] for name in asked} == asked
-    for each in ElementTree.parse(ROOT / "package.xml").iter("exec_depend"):
+    for each in PACKAGE.iter("exec_depend"):
         of_base = not each.text.startswith(("tf2_", "visualization_"))
         name = f"ros-jazzy-{each.text.replace('_', '-')}"
         assert each.text.startswith("python3-") or of_base or name in found
