@@ -26,7 +26,7 @@ from typing import Any
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-LARGEST = 3_000_000
+LARGEST = 1_300_000
 """Bytes of the film."""
 STEPS = ((None, 4), ("s", 40), (None, 6), ("ArrowDown", 8), ("ArrowUp", 8), ("w", 40), (None, 4))
 """Keys, and how often: a touch of S presses 0.3 mm deeper, of W as much less; None waits."""
