@@ -98,8 +98,14 @@ def _report(table: pd.DataFrame) -> Report:
             limits={"16.7 ms: 60 Hz": 1e3 / RATE},
             labels={"ms": "processor time of a frame, ms", "mm": "error of the worst node, mm"},
         ),
-        "motions": table.filter(regex="^(kind|haste|method|error|residual_.*[01]|frames_|cpu)"),
-        "live": table.filter(regex="^(kind|haste|method|live_)"),
+        "motions": table[
+            ["kind", "haste", "method", "error_mm_p50", "error_mm_p99", "residual_p50"]
+            + ["frames_inverted", "cpu_ms_p50", "cpu_ms_p99"]
+        ],
+        "live": table[
+            ["kind", "haste", "method", "live_skipped", "live_error_mm_p50", "live_error_mm_worst"]
+            + ["live_away_ms", "live_latency_ms_p99"]
+        ],
         "kinds": [f"{name}: {kind.words}" for name, kind in KINDS.items()],
     }
     return Report(take_home, places, targets)

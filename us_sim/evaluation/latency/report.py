@@ -58,9 +58,8 @@ def _report(table: pd.DataFrame) -> Report:
     ]
     places = {
         "rows": table.filter(
-            regex="^(case|scheduling|images_a|dropped|not_rec|.*_ms_p|image_mm|cores_all|memory)"
+            regex="^(case|scheduling|images_a|not_rec|.*_ms_p50|.*_image_ms_p99|cores_all|memory)"
         ),
-        "cores": table.filter(regex="^case$|^cores_(?!busy)"),
     }
     return Report(take_home, places, targets)
 

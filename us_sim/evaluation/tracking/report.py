@@ -113,29 +113,24 @@ def _report(table: pd.DataFrame) -> Report:
             share_y=False,
             labels={"cpu_ms_median": "processor time of an image, ms (median)", "error": ""},
         ),
-        "bodies": _summed(
-            shots[shots["condition"] == "plain"], ["marker", "image_size", "distance_m"]
-        ),
-        "conditions": _summed(near, ["marker", "condition"]),
+        "conditions": _tabulate_conditions(near),
     }
     return Report(take_home, places, targets)
 
 
-def _summed(shots: pd.DataFrame, case: list[str]) -> pd.DataFrame:
-    """Counts and errors of all views of a case."""
-    rows = []
-    for values, some in shots.groupby(case, sort=False):
-        errors = {
-            f"{unit}{words}": some[unit].quantile(part)
-            for unit in ("mm", "degrees")
-            for words, part in (("", 0.5), (", 95 %", 0.95))
-        }
-        counts = {
-            "views": len(some),
+def _tabulate_conditions(shots: pd.DataFrame) -> pd.DataFrame:
+    """How many views of each body and condition are found, and their errors."""
+    rows = [
+        {
+            "marker": marker,
+            "condition": condition,
             "found, %": 100 * some["detected"].mean(),
-            "flipped": int(some["flipped"].sum()),
+            "mm": some["mm"].median(),
+            "mm, 95 %": some["mm"].quantile(0.95),
+            "degrees": some["degrees"].median(),
         }
-        rows.append({**dict(zip(case, values, strict=True)), **counts, **errors})
+        for (marker, condition), some in shots.groupby(["marker", "condition"], sort=False)
+    ]
     return pd.DataFrame(rows)
 
 
