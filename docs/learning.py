@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
 
-from us_sim.environment.agents import VisualServo, dark_spots
+from us_sim.environment.agents import VisualServo, find_dark_spots
 from us_sim.environment.environment import ScanEnvironment
 from us_sim.progress import Progress
 
@@ -59,7 +59,7 @@ class Senses(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _sense(self, observation: Any, z: float) -> Any:
         image = observation["image"][..., 0]
-        spots = dark_spots(image)
+        spots = find_dark_spots(image)
         area = spots[0].area if spots else 0.0
         offset = 10.0 * (spots[0].centre[0] / (image.shape[1] - 1) - 0.5) if spots else 0.0
         touch, depth = float(observation["contact"][0]), 100.0 * float(observation["pose"][2])

@@ -13,8 +13,8 @@ from launch_ros.actions import Node
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import RECORDER
-from us_sim.run.domain import alone_on_domain, enclave_of
-from us_sim.run.plan import Request, plan_of, require_new
+from us_sim.run.domain import lock_domain, name_enclave
+from us_sim.run.plan import RunRequest, make_plan, require_new
 from us_sim.scene.reading import load_scene
 from us_sim.settings.viewer import ViewerSettings
 from us_sim.share import find_bag
@@ -50,9 +50,9 @@ def start_session(context):
         raise UsSimError(f"restarts:={given['restarts']}: must be a number of restarts")
     view = ViewerSettings() if given["view"] == "true" else None
     by_hand = view is not None and path is None
-    plan = plan_of(Request(scene, record=record, path=path, view=view, by_hand=by_hand))
-    held.enter_context(alone_on_domain(context.launch_configurations.get("ros_namespace", "")))
-    left_out = [part for part in scene.parts() if not part.needed]
+    plan = make_plan(RunRequest(scene, record=record, path=path, view=view, by_hand=by_hand))
+    held.enter_context(lock_domain(context.launch_configurations.get("ros_namespace", "")))
+    left_out = [part for part in scene.list_parts() if not part.needed]
     return [
         *(LogInfo(msg=f"{part.node} is left out: {part.reason}") for part in left_out),
         *(
@@ -70,7 +70,7 @@ def create_action(process, restarts):
         executable=process.node,
         name=process.node,
         parameters=[process.parameters | further],
-        ros_arguments=["--enclave", enclave_of(process.node)],
+        ros_arguments=["--enclave", name_enclave(process.node)],
         output="screen",
         respawn=restarts > 0,
         respawn_delay=0.5,

@@ -13,8 +13,8 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.parameter import Parameter
 
 from us_sim.command.main import main
-from us_sim.evaluation.independent_forces import least_unbalanced
-from us_sim.evaluation.tissue_methods import TissueMethod
+from us_sim.evaluation.independent_forces import bound_imbalance
+from us_sim.evaluation.tissue_methods import EvaluatedMethod
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.settings.registry import SOLVERS, TRACKERS
@@ -97,20 +97,20 @@ def test_the_solvers_test_holds():
 def test_the_solvers_equations_hold_and_its_entry_can_be_made():
     equations = names_of(file("foundation_equations.py"))["foundation_equations"]
     (entry,) = (code for code in blocks("python") if code.startswith("TissueMethod("))
-    known = {"TissueMethod": TissueMethod, "foundation_equations": equations}
+    known = {"TissueMethod": EvaluatedMethod, "foundation_equations": equations}
     method = eval(entry, known)
     for setting in method.settings:
-        solver = create_solver(method.name, TissueModel.block(nodes=(21, 21, 6)), **setting)
+        solver = create_solver(method.name, TissueModel.make_block(nodes=(21, 21, 6)), **setting)
         forces = method.equations(solver.model)
         for depth in (0.004, 0.008):
             deformation = solver.deform(Pose(position=[0.003, 0.0, depth]))
             assert len(deformation.contact_nodes) > 3
-            unbalanced, _, load = least_unbalanced(solver.model, forces, deformation)
+            unbalanced, _, load = bound_imbalance(solver.model, forces, deformation)
             assert unbalanced < 1e-9 * load
         pushed = deformation.nodes.copy()
         pushed[solver.model.movable_contact_nodes, 0] += 0.004
         moved = replace(deformation, nodes=pushed)
-        unbalanced, _, load = least_unbalanced(solver.model, forces, moved)
+        unbalanced, _, load = bound_imbalance(solver.model, forces, moved)
         assert unbalanced > 0.1 * load
 
 

@@ -17,7 +17,7 @@ from packaging.requirements import Requirement
 
 import us_sim
 from us_sim.errors import TrackingError
-from us_sim.tracking.camera.markers import dictionary
+from us_sim.tracking.camera.markers import load_dictionary
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ElementTree.parse(ROOT / "package.xml")
@@ -171,7 +171,7 @@ def split(requirement):
 
 
 def test_an_opencv_that_finds_no_markers_is_refused(monkeypatch):
-    dictionary.cache_clear()
+    load_dictionary.cache_clear()
     monkeypatch.delattr(cv2.aruco, "ArucoDetector", raising=False)
     with pytest.raises(TrackingError, match=re.escape(cv2.__version__)):
-        dictionary("4X4_50")
+        load_dictionary("4X4_50")

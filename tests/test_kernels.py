@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import us_sim
-from us_sim.kernels import source_files
+from us_sim.kernels import find_kernel_sources
 
 PACKAGE = Path(us_sim.__file__).parent
 CALLED = "from us_sim.kernels import njit\n\n\n@njit\ndef triple(x):\n    return 3 * x\n"
@@ -95,7 +95,7 @@ def test_every_kernel_of_the_package_is_kept_so():
 @pytest.mark.slow
 def test_what_a_kernel_is_made_of_stands_in_files_whose_hash_names_the_folder():
     root = PACKAGE.parent
-    hashed = {file.relative_to(root) for file in source_files()}
+    hashed = {file.relative_to(root) for file in find_kernel_sources()}
     for file in hashed:
         tree = ast.parse((root / file).read_text(encoding="utf-8"))
         unhashed = {

@@ -14,11 +14,11 @@ from geometry_msgs.msg import PoseStamped
 from us_sim.command.main import main
 from us_sim.errors import SceneError
 from us_sim.nodes.probe_tracker import ProbeTracker
-from us_sim.scene.reading import merged
+from us_sim.scene.reading import merge_documents
 from us_sim.scene.scene import Scene
 from us_sim.scoring.exercise import Exercise
-from us_sim.settings.reading import Reader
-from us_sim.settings.tables import anchor
+from us_sim.settings.reading import SettingsReader
+from us_sim.settings.tables import make_anchor
 from us_sim.volume.segmentation.settings import SegmentationSettings
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -63,7 +63,7 @@ def test_every_link_leads_somewhere(page):
         assert file.exists(), link
         if heading:
             titles = re.findall(r"^#+ (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE)
-            assert heading in map(anchor, titles), link
+            assert heading in map(make_anchor, titles), link
 
 
 @pytest.mark.parametrize("page", WRITTEN, ids=names(WRITTEN))
@@ -74,7 +74,7 @@ def test_every_piece_of_a_scene_can_be_read(page):
     for block in re.findall(r"^```yaml\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S):
         given = yaml.safe_load(block)
         if "task" in given:
-            Reader(str(page)).read(Exercise, given)  # and no scene
+            SettingsReader(str(page)).read(Exercise, given)  # and no scene
             continue
         base = arm if given.pop("based_on", None) or given.get("case") else bare
         if {"winkler", "udp"} & {str(word) for word in re.findall(r"\w+", block)}:
@@ -83,12 +83,12 @@ def test_every_piece_of_a_scene_can_be_read(page):
             base = {key: value for key, value in base.items() if key != "volume"}
         structures = given.get("structures", {})
         if isinstance(structures, dict) and any("seeds_mm" in one for one in structures.values()):
-            Reader(str(page)).read(SegmentationSettings, given)  # seeds, and no scene
+            SettingsReader(str(page)).read(SegmentationSettings, given)  # seeds, and no scene
             continue
-        document = merged(base, given)
+        document = merge_documents(base, given)
         if "structures" in document and isinstance(document["structures"], list):
             document["structures"] = {name: {} for name in document["structures"]}
-        Reader(str(page), error=SceneError).read(Scene, document)
+        SettingsReader(str(page), error=SceneError).read(Scene, document)
 
 
 @pytest.mark.slow

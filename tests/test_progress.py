@@ -60,8 +60,8 @@ def test_the_surface_s_compliance_tells_how_far_it_is(monkeypatch, tmp_path):
     monkeypatch.setenv("US_SIM_CACHE", str(tmp_path))
     monkeypatch.setattr(compliance, "_KEPT", 0)
     told = []
-    compliance.surface_compliance(
-        TissueModel.block(), lambda fraction, text: told.append((fraction, text))
+    compliance.compute_compliance(
+        TissueModel.make_block(), lambda fraction, text: told.append((fraction, text))
     )
     fractions = [fraction for fraction, _ in told]
     assert fractions == sorted(fractions)

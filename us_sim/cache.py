@@ -6,11 +6,11 @@ be read all the same is made again.
 
 >>> import os, tempfile
 >>> import numpy as np
->>> from us_sim.cache import kept
+>>> from us_sim.cache import load_or_create
 >>> form = lambda x: ({"x": x}, {}), lambda arrays, facts: arrays["x"]
 >>> with tempfile.TemporaryDirectory() as os.environ["US_SIM_CACHE"]:
-...     made = kept("square", *form, lambda: np.eye(2))
-...     again = kept("square", *form, lambda: 1 / 0)
+...     made = load_or_create("square", *form, lambda: np.eye(2))
+...     again = load_or_create("square", *form, lambda: 1 / 0)
 ...     bool((made == again).all())
 True
 >>> del os.environ["US_SIM_CACHE"]
@@ -45,7 +45,7 @@ def cache_folder() -> Path:
     return Path(given) if given else platformdirs.user_cache_path("us_sim")
 
 
-def kept(
+def load_or_create(
     key: str,
     pack: Callable[[Thing], tuple[Arrays, Facts]],
     unpack: Callable[[Arrays, Facts], Thing],

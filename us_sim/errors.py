@@ -4,12 +4,12 @@ LONGEST = 2000
 """Characters of a sentence: it may quote a file or a message."""
 
 
-def printable(text: str, longest: int = LONGEST) -> str:
+def printable_line(text: str, longest: int = LONGEST) -> str:
     """The text on one line, of nothing that a terminal obeys, without its middle if it is long.
 
     The end stays, since it says what is wrong and what to do.
 
-    >>> printable("a \\x1b[31mname\\nof a stranger", 20)
+    >>> printable_line("a \\x1b[31mname\\nof a stranger", 20)
     'a ?[31mnam … a stranger'
     """
     half = longest // 2
@@ -27,7 +27,7 @@ class UsSimError(Exception):
 
     def __str__(self) -> str:
         """The sentence in one line, whatever the names in it are made of."""
-        return printable(super().__str__())
+        return printable_line(super().__str__())
 
 
 class SettingsError(UsSimError):

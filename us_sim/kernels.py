@@ -40,10 +40,10 @@ _IN_USE = 86400.0  # s after a process began with a folder, in which it is not r
 njit: Any = partial(numba.njit, no_cfunc_wrapper=True)
 
 
-def keep_kernels() -> Path:
+def enable_kernel_cache() -> Path:
     """Have numba keep what it compiles in the folder of these sources; remove long unused ones."""
     place = Path(getattr(config, "CACHE_DIR", "") or cache_folder() / "kernels")
-    sources = b"".join(map(Path.read_bytes, source_files()))
+    sources = b"".join(map(Path.read_bytes, find_kernel_sources()))
     name = f"us_sim-{__version__}-{source_hash(sources).hex()}"
     try:
         (place / name).mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -65,11 +65,11 @@ def keep_kernels() -> Path:
     return place / name
 
 
-def source_files() -> list[Path]:
+def find_kernel_sources() -> list[Path]:
     """The package's files that name numba or a kernel; no other has a part in any."""
     named = re.compile(rb"numba|kernel")
     files = sorted(Path(__file__).parent.rglob("*.py"))
     return [file for file in files if named.search(file.read_bytes())]
 
 
-keep_kernels()
+enable_kernel_cache()

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from tqdm import tqdm
 
-from us_sim.errors import printable
+from us_sim.errors import printable_line
 
 _LONGEST = 200  # characters of what is being done
 _PATIENCE = 1.0  # s, for which work goes on without a bar
@@ -43,7 +43,7 @@ class Progress(tqdm):
 
     def update(self, done: float, text: str = "") -> None:  # type: ignore[override]
         """Show that ``done`` of the total is done."""
-        self.set_postfix_str(printable(text, _LONGEST), refresh=False)
+        self.set_postfix_str(printable_line(text, _LONGEST), refresh=False)
         super().update((done if self.total is None else min(done, self.total)) - self.n)
 
 

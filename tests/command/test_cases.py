@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from us_sim.command.main import main
-from us_sim.settings.reading import Reader
+from us_sim.settings.reading import SettingsReader
 from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.writing import write_labels, write_volume
@@ -23,7 +23,7 @@ def cases(tmp_path, monkeypatch):
     volume = Volume(np.full(labels.shape, 120, np.uint8), grid, labels)
     probe = {"aperture": "30 mm", "depth": "40 mm", "image": [150, 200]}
     document = {"name": "arm", "region": "upper arm", "probe": probe}
-    settings = Reader("case").read(CaseSettings, document)
+    settings = SettingsReader("case").read(CaseSettings, document)
     structures = {"vein": CaseStructure(6, colour=(0.0, 0.0, 1.0))}
     with new_case(tmp_path / "cases" / "arm") as folder:
         write_volume(folder / "volume.nrrd", volume)

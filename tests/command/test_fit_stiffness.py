@@ -9,12 +9,12 @@ from wrench_files import WrenchRecord, write_wrenches
 
 from us_sim.command.main import main
 from us_sim.recording.path import ProbePath, write_poses
-from us_sim.recording.press_and_slide import press_and_slide
+from us_sim.recording.press_and_slide import make_press_and_slide
 from us_sim.recording.writer import BagWriter
-from us_sim.scene.building import materials_of, tissue_model_of, volume_of
+from us_sim.scene.building import build_materials, build_tissue_model, load_volume
 from us_sim.scene.reading import load_scene
-from us_sim.settings.reading import Reader
-from us_sim.tissue.stiffness_fit import press_wrenches
+from us_sim.settings.reading import SettingsReader
+from us_sim.tissue.stiffness_fit import simulate_wrenches
 from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.writing import write_volume
@@ -24,12 +24,12 @@ from us_sim.volume.volume import Volume
 def felt_in(source, name, modulus, path) -> np.ndarray:
     """The wrenches (K, 6) of a press of a scene, one of whose structures has another modulus."""
     scene = load_scene(str(source))
-    volume = volume_of(scene)
-    model = tissue_model_of(scene, volume)
+    volume = load_volume(scene)
+    model = build_tissue_model(scene, volume)
     given = dict(scene.tissue.materials)
     given[name] = replace(given[name], young_modulus=modulus)
-    model = replace(model, materials=materials_of(scene, given, model.mesh, volume))
-    wrenches = press_wrenches(model, path.poses, path.positions[:, 2])
+    model = replace(model, materials=build_materials(scene, given, model.mesh, volume))
+    wrenches = simulate_wrenches(model, path.poses, path.positions[:, 2])
     return wrenches + np.random.default_rng(3).normal(scale=0.005, size=wrenches.shape)
 
 
@@ -57,7 +57,7 @@ def record_of(path, wrenches, frame="probe") -> WrenchRecord:
     ids=["no wrench", "other frame", "other pose frame", "no numbers"],
 )
 def test_what_is_no_press_is_one_sentence(small_scene, tmp_path, capsys, spoil, word):
-    path = replace(press_and_slide(rate=4.0, duration=10.0), topic="/probe/pose")
+    path = replace(make_press_and_slide(rate=4.0, duration=10.0), topic="/probe/pose")
     wrenches = np.random.default_rng(0).normal(size=(len(path), 6))
     recording = session(tmp_path / "bag", *spoil(path, wrenches))
     out = tmp_path / "fitted.yaml"
@@ -80,8 +80,10 @@ def test_the_moduli_of_a_case_are_found_from_its_press(tmp_path):
     given = {"name": "gel", "start": {}, "probe": probe, "around": {"young_modulus": 7e3}}
     with new_case(case) as folder:
         write_volume(folder / "volume.nrrd", Volume(grey, grid))
-        write_case_settings(folder, Reader("case.yaml").read(CaseSettings, given | {"nodes": 500}))
-    path = replace(press_and_slide(rate=4.0, depth=0.006), topic="/probe/pose")
+        write_case_settings(
+            folder, SettingsReader("case.yaml").read(CaseSettings, given | {"nodes": 500})
+        )
+    path = replace(make_press_and_slide(rate=4.0, depth=0.006), topic="/probe/pose")
     wrenches = felt_in(f"case:{case}", "tissue", 11e3, path)
     recording = session(tmp_path / "bag", path, record_of(path, wrenches))
     out = tmp_path / "fitted.yaml"

@@ -27,7 +27,7 @@ def test_a_sweep_becomes_a_case_that_says_what_was_done_and_not_of_whom(sweep, t
     options = ["--spacing", "1 mm", "--clip", "0", "0", "9", "9"]
     assert main(["reconstruct", str(path), "--out", str(out), *options]) == 0
     case = read_case(out)
-    assert case.volume().shape == (10, 10, 12)
+    assert case.read_volume().shape == (10, 10, 12)
     assert case.settings.probe.geometry == "linear"  # as wide as the rectangle that is used
     assert case.settings.probe.array.given.aperture == pytest.approx(10 * PIXEL)
     assert len(case.settings.scanned) == 11

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from us_sim.command.main import main
-from us_sim.command.reference import reference_page, reference_sections
+from us_sim.command.reference import make_reference_sections, write_reference_page
 from us_sim.nodes.settings import NODES, parameters_of
 from us_sim.scene.reading import load_scene
 from us_sim.settings.registry import SOLVERS, TRACKERS
@@ -16,7 +16,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference.md"
 
 
 def test_the_page_is_what_the_code_says():
-    assert PAGE.read_text(encoding="utf-8") == reference_page(), (
+    assert PAGE.read_text(encoding="utf-8") == write_reference_page(), (
         "docs/reference.md is not what the code says: write it anew with "
         "`python -m us_sim reference --out docs/reference.md`"
     )
@@ -27,7 +27,7 @@ def keys_in(section):
 
 
 def test_every_parameter_of_every_node_is_on_it():
-    sections = {section.path: section for _, section in reference_sections()}
+    sections = {section.path: section for _, section in make_reference_sections()}
     scene = load_scene("upper_arm")
     for node in NODES:
         told = keys_in(sections[node]) | keys_in(sections["scene_nodes"])
@@ -54,10 +54,10 @@ def test_every_parameter_of_every_node_is_on_it():
 
 
 def test_every_source_of_poses_is_on_it_with_all_its_keys():
-    sections = {section.path: section for _, section in reference_sections()}
+    sections = {section.path: section for _, section in make_reference_sections()}
     assert keys_in(sections["tracker.source"]) == {"source", *TRACKERS}
     for name in TRACKERS:
-        keys = set(rules_of(TRACKERS.settings(name)))
+        keys = set(rules_of(TRACKERS.load_settings(name)))
         assert not keys or keys_in(sections[f"tracker.{name}"]) == keys
 
 
@@ -80,4 +80,4 @@ def test_a_part_that_is_not_there_is_said(name, meant, capsys):
 
 def test_the_page_is_written_to_a_file(tmp_path):
     assert main(["reference", "--out", str(tmp_path / "page.md")]) == 0
-    assert (tmp_path / "page.md").read_text(encoding="utf-8") == reference_page()
+    assert (tmp_path / "page.md").read_text(encoding="utf-8") == write_reference_page()

@@ -8,10 +8,10 @@ import pytest
 from session_files import EPOCH, PERIOD, TYPES, T, cloud, image, pose, press, write
 
 from us_sim.command.main import main
-from us_sim.recording.schemas import jazzy_definitions
+from us_sim.recording.schemas import load_jazzy_definitions
 from us_sim.recording.writer import BagWriter
 from us_sim.run.session_score import read_scan
-from us_sim.scene.building import tissue_model_of, volume_of
+from us_sim.scene.building import build_tissue_model, load_volume
 from us_sim.scene.reading import load_scene
 
 
@@ -73,13 +73,13 @@ MARKS = ("frozen", "needle in", "frozen")
 @pytest.fixture(scope="module")
 def squashed(small_scene, tmp_path_factory):
     """A session along the vein whose tissue is pressed to half its height for a while."""
-    model = tissue_model_of(load_scene(small_scene), volume_of(load_scene(small_scene)))
+    model = build_tissue_model(load_scene(small_scene), load_volume(load_scene(small_scene)))
     rest, half = model.mesh.nodes, model.mesh.nodes * [1.0, 1.0, 0.5]
     layout = T["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
     tetrahedra = T["std_msgs/msg/Int32MultiArray"](
         layout=layout, data=model.mesh.tetrahedra.astype(np.int32).ravel()
     )
-    store = jazzy_definitions()
+    store = load_jazzy_definitions()
     mesh = store.serialize_cdr(tetrahedra, "std_msgs/msg/Int32MultiArray", little_endian=True)
     file = tmp_path_factory.mktemp("squashed") / "s.mcap"
     latched = {
@@ -89,14 +89,14 @@ def squashed(small_scene, tmp_path_factory):
     with BagWriter(file, sidecar=False) as bag:
         for topic, kind in {**TYPES, "/session/marker": "std_msgs/msg/String"}.items():
             bag.add_topic(topic, kind)
-        bag.attach("scene.yaml", "text/yaml", small_scene.read_bytes(), EPOCH)
+        bag.attach_file("scene.yaml", "text/yaml", small_scene.read_bytes(), EPOCH)
         for topic, (kind, data) in latched.items():
             bag.add_topic(topic, kind)
-            bag.write(topic, data, EPOCH)
+            bag.write_message(topic, data, EPOCH)
         for text in MARKS:
             marked = T["std_msgs/msg/String"](data=text)
             data = store.serialize_cdr(marked, "std_msgs/msg/String", little_endian=True)
-            bag.write("/session/marker", data, EPOCH)
+            bag.write_message("/session/marker", data, EPOCH)
         for k in range(9):
             stamp = EPOCH + k * 10**8
             nodes = half if 3 <= k < 6 else rest
@@ -106,7 +106,7 @@ def squashed(small_scene, tmp_path_factory):
                 ("/tissue/nodes", cloud(stamp, nodes)),
                 ("/ultrasound/image", image(stamp, pixels)),
             ):
-                bag.write(topic, data, stamp)
+                bag.write_message(topic, data, stamp)
     return file
 
 

@@ -6,7 +6,7 @@ import yaml
 
 from us_sim.command.main import main
 from us_sim.geometry.transducer import ProbeSettings
-from us_sim.settings.reading import Reader
+from us_sim.settings.reading import SettingsReader
 from us_sim.volume.cases.case import read_case
 from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.cases.writing import new_case, write_case_settings
@@ -37,7 +37,7 @@ def case(tmp_path):
     structures = {"vein": CaseStructure(3, material="artery"), "bone": CaseStructure(1)}
     with new_case(tmp_path / "arm") as folder:
         write_volume(folder / "volume.nrrd", block())
-        probe = Reader("probe").read(ProbeSettings, {"aperture": "30 mm", "depth": "40 mm"})
+        probe = SettingsReader("probe").read(ProbeSettings, {"aperture": "30 mm", "depth": "40 mm"})
         start = CaseStart()  # to propose both takes long
         fixed = ("bottom", "bone")
         settings = CaseSettings("arm", "", "", probe, start, structures=structures, fixed=fixed)
@@ -61,7 +61,7 @@ def test_seeds_make_labels_surfaces_and_a_picture(case, seeds, capsys):
     assert main(["segment", str(case), "--seeds", seeds]) == 0
     said = capsys.readouterr().out
     opened = read_case(case)
-    volume = opened.volume()
+    volume = opened.read_volume()
     assert volume.label_names == {0: "tissue", 1: "vein", 2: "body"}
     np.testing.assert_array_equal(volume.labels == 1, block().labels == 6)
     assert {file.stem for file in (case / "surfaces").iterdir()} == {"body", "vein"}

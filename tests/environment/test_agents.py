@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from us_sim.environment.agents import VisualServo, dark_spots
+from us_sim.environment.agents import VisualServo, find_dark_spots
 from us_sim.environment.environment import ScanEnvironment
 
 
@@ -13,11 +13,11 @@ def test_spots_are_where_they_were_drawn_and_the_largest_comes_first():
     image = random.rayleigh(60, (256, 256)).clip(0, 255).astype(np.uint8)
     for centre, axes in (((150, 90), (24, 15)), ((90, 100), (13, 13)), ((250, 200), (20, 20))):
         cv2.ellipse(image, centre, axes, 0, 0, 360, 5, -1)  # the last crosses the border
-    large, small = dark_spots(image)
+    large, small = find_dark_spots(image)
     assert large.centre == pytest.approx((150, 90), abs=1)
     assert small.centre == pytest.approx((90, 100), abs=1)
     assert large.area == pytest.approx(np.pi * 24 * 15, rel=0.1)
-    assert dark_spots(np.zeros((256, 256), np.uint8)) == []
+    assert find_dark_spots(np.zeros((256, 256), np.uint8)) == []
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ import yaml
 
 from us_sim.command.main import main
 from us_sim.environment import dataset
-from us_sim.environment.agents import Wander
+from us_sim.environment.agents import WanderingAgent
 from us_sim.environment.environment import ScanEnvironment
 
 STEPS = 6
@@ -89,8 +89,8 @@ def test_the_same_command_makes_only_what_is_missing(scene, made, monkeypatch, c
     before = digests(made)
     (made / "00-short-000002.tar").unlink()
     seen = []
-    record = dataset._record
-    monkeypatch.setattr(dataset, "_record", lambda *args: seen.append(args) or record(*args))
+    record = dataset._record_shard
+    monkeypatch.setattr(dataset, "_record_shard", lambda *args: seen.append(args) or record(*args))
     assert make(scene, made, "--task", "FindVein") == 0
     assert [order.name for order, _ in seen] == ["00-short-000002"]
     assert digests(made) == before
@@ -107,7 +107,7 @@ def test_another_data_set_or_folder_is_refused(scene, made, tmp_path, capsys):
 
 
 def test_an_episode_that_fails_is_told_and_the_others_go_on(scene, tmp_path, monkeypatch, capsys):
-    class Stumbles(Wander):
+    class Stumbles(WanderingAgent):
         def __init__(self, seed):
             super().__init__(seed)
             if seed == json.loads((tmp_path / "seed").read_text()):
@@ -115,7 +115,7 @@ def test_an_episode_that_fails_is_told_and_the_others_go_on(scene, tmp_path, mon
 
     out = tmp_path / "set"
     (tmp_path / "seed").write_text(str(np.random.SeedSequence([0, 0, 1]).generate_state(1)[0]))
-    monkeypatch.setattr(dataset, "Wander", Stumbles)
+    monkeypatch.setattr(dataset, "WanderingAgent", Stumbles)
     assert make(scene, out) == 1
     told = json.loads((out / "manifest.json").read_text())["episodes"]
     assert [("error" in each, each.get("images")) for each in told.values()] == [

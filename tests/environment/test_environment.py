@@ -12,7 +12,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 import us_sim.environment
 from us_sim.environment.environment import ScanEnvironment
-from us_sim.environment.simulation import Draw, Simulation
+from us_sim.environment.simulation import EpisodeDraw, ScanSimulation
 from us_sim.errors import EpisodeError, SceneError
 from us_sim.geometry.pose import Pose
 from us_sim.scene.reading import load_scene
@@ -112,7 +112,7 @@ def test_an_action_is_a_velocity_in_the_probes_frame(plain):
     for _ in range(9):
         observation, *_ = plain.step([0.5, 0, 0.25, 0, 0, 0])
     # 9 steps of 1/30 s at 15 mm/s along x and 7.5 mm/s along z.
-    expected = turned.apply(np.array([[4.5e-3, 0, 2.25e-3]]))[0]
+    expected = turned.transform_points(np.array([[4.5e-3, 0, 2.25e-3]]))[0]
     assert observation["pose"][:3] == pytest.approx(expected, abs=1e-8)
     for _ in range(6):
         observation, *_ = plain.step([0, 0, 0, 0, 0, -1])
@@ -264,22 +264,24 @@ def test_following_the_goal_is_no_error(scene):
 
 def test_stiffer_tissue_pushes_back_more_and_moves_alike(scene):
     """Linear elasticity under a prescribed indentation: forces are as the moduli, motion is not."""
-    simulation = Simulation(load_scene(scene))
+    simulation = ScanSimulation(load_scene(scene))
     labels = simulation.scene.tissue.materials
     simulation.reset()
     one = simulation.step(Pose([0, 0, 0.005]))
-    simulation.reset(Draw(stiffness=dict.fromkeys(labels, 3.0)))
+    simulation.reset(EpisodeDraw(stiffness=dict.fromkeys(labels, 3.0)))
     other = simulation.step(Pose([0, 0, 0.005]))
     assert other.force == pytest.approx(3 * one.force, rel=1e-6)
     assert np.abs(other.frame.nodes - one.frame.nodes).max() < 1e-8
 
 
 def test_thickness_multiplies_the_depths_of_labels(scene):
-    simulation = Simulation(load_scene(scene))
+    simulation = ScanSimulation(load_scene(scene))
 
     def depth(thickness):
-        simulation.reset(Draw(thickness=thickness))
-        rows = np.nonzero(simulation.labels_at_rest(Pose()) == simulation.label("vein"))[0]
+        simulation.reset(EpisodeDraw(thickness=thickness))
+        rows = np.nonzero(
+            simulation.compute_labels_at_rest(Pose()) == simulation.find_label("vein")
+        )[0]
         return rows.mean()
 
     assert depth(1.2) == pytest.approx(1.2 * depth(1.0), abs=0.7)  # rows, whose middles are at .5

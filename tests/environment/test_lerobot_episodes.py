@@ -11,7 +11,7 @@ import yaml
 
 from us_sim.command.main import main
 from us_sim.environment.environment import ScanEnvironment
-from us_sim.environment.lerobot_episodes import frames_a_second, read_episode
+from us_sim.environment.lerobot_episodes import compute_frame_rate, read_episode
 from us_sim.errors import EpisodeError
 from us_sim.recording.lerobot_writer import LeRobotEpisode, write_episodes
 
@@ -162,9 +162,9 @@ def test_a_missing_lerobot_and_a_rate_that_is_none_are_told_before_work(
     assert main(["dataset", *scenes, "--out", str(tmp_path / "set"), "--format", "lerobot"]) == 1
     assert "scenes have [30, 50] steps a second" in capsys.readouterr().err
     assert not (tmp_path / "set").exists()
-    assert frames_a_second(1 / 30) == 30
+    assert compute_frame_rate(1 / 30) == 30
     with pytest.raises(EpisodeError, match=r"makes 33\.3333 steps a second.*set it to"):
-        frames_a_second(0.03)
+        compute_frame_rate(0.03)
 
 
 def test_lerobot_itself_loads_the_same_for_any_number_of_workers(scene, made, tmp_path, capsys):

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from us_sim.errors import ProbeError
 from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
-from us_sim.geometry.collider_distance import signed_distance
+from us_sim.geometry.collider_distance import measure_distances
 from us_sim.geometry.pose import Pose
 
 # A core of 50 mm radius, whose front reaches 30 mm to each side: its ends are 40 mm above the
@@ -29,7 +29,7 @@ shape = st.sampled_from(SHAPES)
 
 
 def distance(collider, point, pose=None):
-    found, normal = signed_distance(collider, pose or Pose(), np.array([point], dtype=float))
+    found, normal = measure_distances(collider, pose or Pose(), np.array([point], dtype=float))
     return found[0], normal[0]
 
 
@@ -44,7 +44,7 @@ def test_touches_the_plane_z_0_at_the_origin_and_lies_behind_it(collider):
 
 def test_sphere_is_the_distance_to_its_centre_less_its_radius():
     points = np.random.default_rng(1).uniform(-0.1, 0.1, (50, 3))
-    found, normal = signed_distance(Sphere(0.03), Pose(), points)
+    found, normal = measure_distances(Sphere(0.03), Pose(), points)
     away = points - [0.0, 0.0, -0.03]
     length = np.linalg.norm(away, axis=1)
     np.testing.assert_allclose(found, length - 0.03, atol=1e-15)
@@ -122,7 +122,7 @@ def test_inside_its_core_a_convex_array_is_as_deep_as_the_nearest_side_of_it(col
     points[:, 2] = back + random[:, 2] * (np.interp(points[:, 0], x, front) - back)
     in_plane, which = cKDTree(outline).query(points[:, [0, 2]])
     across = half_y - np.abs(points[:, 1])
-    found, normal = signed_distance(collider, Pose(), points)
+    found, normal = measure_distances(collider, Pose(), points)
     # The outline's points are at most 6 µm apart.
     np.testing.assert_allclose(found, -np.minimum(in_plane, across) - rounding, atol=6e-6)
     # Where one side is clearly the nearest, the normal points to the nearest point of it.
@@ -166,8 +166,8 @@ def test_normal_is_the_gradient_away_from_the_core(collider, where):
 @given(shape, point, point, orientation)
 def test_moving_probe_and_points_together_changes_nothing(collider, where, position, quaternion):
     pose = Pose(np.array(position), np.array(quaternion))
-    moved = pose.apply(np.array([where]))
-    found, normal = signed_distance(collider, pose, moved)
+    moved = pose.transform_points(np.array([where]))
+    found, normal = measure_distances(collider, pose, moved)
     expected, direction = distance(collider, where)
     assert found[0] == pytest.approx(expected, abs=1e-12)
     if expected < -0.5 * collider.offset_box[3]:

@@ -49,7 +49,7 @@ def test_links_of_any_rates_and_stamps_ahead_make_poses_of_one_time(periods, ahe
         for frame, period in zip(MOTIONS, periods, strict=True)
         for at in range(0, 1500, period)
     ]
-    made = [chain.move(*sent(frame, stamp)) for _, frame, stamp in sorted(messages)]
+    made = [chain.update_link(*sent(frame, stamp)) for _, frame, stamp in sorted(messages)]
     made = [each for each in made if each is not None]
     assert len(made) >= 1000 // max(periods)
     assert (np.diff([stamp for stamp, _ in made]) > 0).all()
@@ -59,31 +59,31 @@ def test_links_of_any_rates_and_stamps_ahead_make_poses_of_one_time(periods, ahe
 
 def test_a_fixed_link_is_at_every_time_and_a_chain_of_these_moves_never():
     chain = FrameChain("tool", "map")
-    chain.fix("tool", "arm", turned(0.0, [0.0, 0.0, 0.1]))
-    assert chain.links() is None
-    chain.fix("arm", "map", turned(0.0, [0.0, 0.2, 0.0]))
+    chain.set_fixed_link("tool", "arm", turned(0.0, [0.0, 0.0, 0.1]))
+    assert chain.find_links() is None
+    chain.set_fixed_link("arm", "map", turned(0.0, [0.0, 0.2, 0.0]))
     assert chain.is_fixed
-    stamp, pose = chain.move("arm", "map", 5 * MS, turned(0.0, [0.0, 0.3, 0.0]))
+    stamp, pose = chain.update_link("arm", "map", 5 * MS, turned(0.0, [0.0, 0.3, 0.0]))
     assert stamp == 5 * MS
     np.testing.assert_allclose(pose.position, [0.0, 0.3, 0.1])
 
 
 def test_a_link_that_stands_still_in_time_is_named_and_frames_that_go_round_are_no_way():
     chain = FrameChain("tool", "arm")
-    chain.move(*sent("tool", 0))
+    chain.update_link(*sent("tool", 0))
     other = FrameChain("tool", "base")
     for at in (0, 1000, 2000):
-        other.move(*sent("arm", at))
-    assert chain.lag() == ("tool", 0.0)
-    other.move(*sent("tool", 0))
-    assert other.lag() == ("tool", 2.0)
-    other.move("base", "tool", 0, Pose())
-    other.move("arm", "tool", 0, Pose())
-    assert other.links() is None
+        other.update_link(*sent("arm", at))
+    assert chain.find_slowest_link() == ("tool", 0.0)
+    other.update_link(*sent("tool", 0))
+    assert other.find_slowest_link() == ("tool", 2.0)
+    other.update_link("base", "tool", 0, Pose())
+    other.update_link("arm", "tool", 0, Pose())
+    assert other.find_links() is None
 
 
 def test_stamps_that_go_back_begin_again_by_a_second_and_are_late_by_less():
     chain = FrameChain("tool", "arm")
-    assert chain.move(*sent("tool", 5000))[0] == 5000 * MS
-    assert chain.move(*sent("tool", 4500)) is None
-    assert chain.move(*sent("tool", 10))[0] == 10 * MS
+    assert chain.update_link(*sent("tool", 5000))[0] == 5000 * MS
+    assert chain.update_link(*sent("tool", 4500)) is None
+    assert chain.update_link(*sent("tool", 10))[0] == 10 * MS

@@ -86,7 +86,7 @@ def test_left_jacobian_is_the_derivative(vector, direction):
 @quick
 @given(poses, poses, st.floats(0.0, 1.0))
 def test_interpolation_goes_straight_and_turns_evenly(a, b, part):
-    between = se3.interpolate(a, b, part)
+    between = se3.interpolate_poses(a, b, part)
     np.testing.assert_allclose(
         between.position, (1 - part) * a.position + part * b.position, atol=1e-12
     )
@@ -100,7 +100,7 @@ def test_interpolation_goes_straight_and_turns_evenly(a, b, part):
 def test_interpolation_takes_the_shorter_way_whatever_the_quaternions_sign():
     turned = se3.exp(np.array([0.0, 0, 0, 0, 0, np.radians(80)]))
     flipped = Pose(turned.position, -turned.orientation)
-    half = se3.interpolate(Pose(), flipped, 0.5)
+    half = se3.interpolate_poses(Pose(), flipped, 0.5)
     np.testing.assert_allclose(
         np.degrees(se3.rotation_log(half.orientation)), [0, 0, 40], atol=1e-12
     )

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from us_sim.geometry.triangles import TriangleParts, vertex_normals
+from us_sim.geometry.triangles import TriangleParts, compute_vertex_normals
 
 
 @pytest.fixture(params=[np.float32, np.float64])
@@ -23,7 +23,7 @@ def test_an_octahedron_s_normals_are_its_corners(dtype):
             for z in (0, 1)
         ]
     )
-    normals = vertex_normals(corners.astype(dtype), triangles)
+    normals = compute_vertex_normals(corners.astype(dtype), triangles)
     assert normals.dtype == dtype
     np.testing.assert_array_equal(normals, corners)
 
@@ -31,7 +31,7 @@ def test_an_octahedron_s_normals_are_its_corners(dtype):
 def test_normals_are_weighted_by_area(dtype):
     """Two right triangles share a vertex: 0.5 m² facing z, and 2 m² facing x."""
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 2, 0], [0, 0, 2]], dtype=dtype)
-    normals = vertex_normals(vertices, np.array([[0, 1, 2], [0, 3, 4]]))
+    normals = compute_vertex_normals(vertices, np.array([[0, 1, 2], [0, 3, 4]]))
     np.testing.assert_allclose(normals[0], np.array([4, 0, 1]) / np.sqrt(17), rtol=1e-6)
 
 

@@ -9,7 +9,7 @@ from rosbags.highlevel import AnyReader
 
 from us_sim.command.main import main
 from us_sim.recording.reader import read_bag
-from us_sim.run.session_check import check
+from us_sim.run.session_check import check_bag
 
 TOPICS = {
     "/tracker/pose": "geometry_msgs/msg/PoseStamped",
@@ -54,7 +54,7 @@ def test_every_topic_of_the_graph_is_recorded_with_type_and_stamps(demo):
 
 def test_the_recording_is_whole(demo):
     """But for gaps and late images, which a busy machine may make."""
-    found = check(read_bag(demo / "session.mcap")).findings
+    found = check_bag(read_bag(demo / "session.mcap")).findings
     assert not [each for each in found if each.kind not in ("gap", "latency")]
 
 

@@ -90,4 +90,4 @@ def test_a_run_ends_after_its_duration_with_its_summary(played_scene, tmp_path):
     result = us_sim("run", played_scene, "--record", recording, "--duration", 2)
     assert (result.returncode, result.stdout) == (0, f"recorded to {recording}\n"), result.stderr
     assert "Traceback" not in result.stderr
-    assert read_bag(recording).topic("/diagnostics").message_count > 0
+    assert read_bag(recording).find_topic("/diagnostics").message_count > 0

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from us_sim.recording.path import write_path
-from us_sim.recording.press_and_slide import press_and_slide
+from us_sim.recording.press_and_slide import make_press_and_slide
 from us_sim.volume.cases.case import read_case
 
 
@@ -50,7 +50,7 @@ def test_the_case_has_two_veins_and_a_probe_and_no_name_of_the_sweep(case):
 
 def test_its_vessels_deform_when_it_is_pressed(case, tmp_path):
     path = tmp_path / "press.mcap"
-    write_path(path, press_and_slide(rate=15.0, duration=3.0, depth=0.02), sidecar=False)
+    write_path(path, make_press_and_slide(rate=15.0, duration=3.0, depth=0.02), sidecar=False)
     said = run(tmp_path, "demo", "--case", case, "--path", path, "--out", "press")
     assert "images out" in said
     areas = json.loads((tmp_path / "press" / "summary.json").read_text())["areas"]

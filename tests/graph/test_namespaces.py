@@ -35,7 +35,7 @@ def test_two_simulators_in_one_graph_share_nothing(small_scene, short_path, tmp_
         assert all(name.startswith(f"/{space}/") for name in topics), topics
         image = "scanner/image" if space == "right" else "ultrasound/image"
         assert topics[f"/{space}/{image}"] > 10
-        poses = [bag.deserialize(each) for each in bag.messages([f"/{space}/probe/pose"])]
+        poses = [bag.deserialize(each) for each in bag.read_messages([f"/{space}/probe/pose"])]
         assert {round(p.pose.position.x, 6) for p in poses} == {RIGHT if space == "right" else 0.0}
 
 

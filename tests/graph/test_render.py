@@ -9,7 +9,7 @@ import pytest
 from command import us_sim
 
 from us_sim.command.main import main
-from us_sim.environment.simulation import Simulation
+from us_sim.environment.simulation import ScanSimulation
 from us_sim.geometry.pose import Pose
 from us_sim.recording.path import read_path
 from us_sim.recording.reader import read_bag
@@ -49,7 +49,7 @@ def again(first, tmp_path_factory):
 
 def payloads(folder):
     messages: dict[str, list[bytes]] = {}
-    for message in read_bag(folder / "session.mcap").messages():
+    for message in read_bag(folder / "session.mcap").read_messages():
         messages.setdefault(message.topic, []).append(bytes(message.data))
     return messages
 
@@ -78,7 +78,9 @@ def test_messages_are_identical(first, again):
 def test_the_same_poses_make_the_same_images_without_ros(first, played_scene):
     """But for the topics' 32 bits: a node is 2e-9 m off, and few pixels round otherwise."""
     scene = load_scene(played_scene)
-    simulation = Simulation(replace(scene, tissue=replace(scene.tissue, solver="fem_nonlinear")))
+    simulation = ScanSimulation(
+        replace(scene, tissue=replace(scene.tissue, solver="fem_nonlinear"))
+    )
     files = sorted((first / "images").glob("*.png"))
     path = read_path(first / "session.mcap", "/probe/pose")
     apart = []

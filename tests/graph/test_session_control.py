@@ -65,7 +65,7 @@ def test_scenes_recordings_and_replays_are_changed_while_it_runs(
     assert {node for node in after if after[node] != before[node]} == {"probe_tracker"}
     control.until(lambda: not read_bag(tmp_path / "session.mcap").fault)  # it has its index
     bag = read_bag(tmp_path / "session.mcap")
-    assert bag.topic("/ultrasound/image").message_count > 5
+    assert bag.find_topic("/ultrasound/image").message_count > 5
 
     # Scenes that cannot be are refused, and nothing changes.
     assert "there is no scene file nowhere" in control.set(scene="nowhere")

@@ -54,7 +54,7 @@ def main(rate: float, duration: float, folder: Path) -> int:
     recorder.wait(60)
     rclpy.shutdown()
     bag = read_bag(file)
-    recorded, lost = bag.message_count, sum(bag.lost().values())
+    recorded, lost = bag.message_count, sum(bag.count_losses().values())
     print(
         f"{count} published ({count * SIZE / seconds / 1e6:.0f} MB/s), {recorded} recorded, "
         f"{lost} lost by the recorder's account, {count - recorded - lost} of which it knows "

@@ -14,8 +14,8 @@ from sensor_msgs.msg import Image
 from us_sim.errors import MeshError, SettingsError
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.streams.annotated_image import AnnotatedImage
-from us_sim.scene.building import probe_of
-from us_sim.slicing.cutting.resampling import Located
+from us_sim.scene.building import build_probe
+from us_sim.slicing.cutting.resampling import LocatedPixels
 from us_sim.slicing.drawing.overlay import ColourScale, Overlay
 from us_sim.volume.volume import Volume
 
@@ -49,7 +49,7 @@ class Shown:
     @property
     def placed(self):
         pixels = np.array([[[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]])
-        return Located(np.zeros(self.labels.shape, np.int32), pixels, np.empty(0, np.intp))
+        return LocatedPixels(np.zeros(self.labels.shape, np.int32), pixels, np.empty(0, np.intp))
 
 
 class Asked:
@@ -87,7 +87,7 @@ class Show(SceneNode):
 
     def __init__(self, streams=(), **kwargs):
         super().__init__("show", **kwargs)
-        self.annotated = AnnotatedImage(self, probe_of(self.scene), LABELS, streams)
+        self.annotated = AnnotatedImage(self, build_probe(self.scene), LABELS, streams)
 
     def stamp(self, age=0.0):
         now = self.get_clock().now().nanoseconds - round(1e9 * age)
@@ -128,7 +128,7 @@ def test_a_fresh_image_is_sent_with_its_stamp_and_outlines(bench, show):
     stamp = node.stamp()
     labels = np.zeros((120, 160), np.uint8)
     labels[40:80, 40:100] = 6
-    node.annotated.pose_came()
+    node.annotated.on_usable_pose()
     node.annotated.show(Shown(GREY_IMAGE, labels), stamp)
     bench.spin_until(lambda: any(message.header.stamp.sec for message in pictures))
     message = pictures[-1]
@@ -144,7 +144,7 @@ def test_a_fresh_image_is_sent_with_its_stamp_and_outlines(bench, show):
 
 def test_nothing_is_drawn_and_no_label_is_cut_for_nobody(bench, show):
     node = show()
-    node.annotated.pose_came()
+    node.annotated.on_usable_pose()
     node.annotated.show(Asked(), node.stamp())
     bench.spin_for(40)
     assert not Asked.called
@@ -200,7 +200,7 @@ def test_without_new_poses_the_last_image_is_frozen_marked_and_keeps_its_stamp(b
     node = show(stale_after=0.3, lost_after=0.8)
     pictures = subscribed(bench, node)
     stamp = node.stamp()
-    node.annotated.pose_came()
+    node.annotated.on_usable_pose()
     node.annotated.show(Shown(GREY_IMAGE), stamp)
     bench.spin_until(lambda: pictures and frame(pictures[-1]) == AMBER)
     assert node.annotated.state == "stale"
@@ -210,7 +210,7 @@ def test_without_new_poses_the_last_image_is_frozen_marked_and_keeps_its_stamp(b
     assert all(message.header.stamp == stamp for message in marked)
     assert all((picture(message)[60, 20:100] == 90).all() for message in marked)
     fresh = node.stamp()
-    node.annotated.pose_came()
+    node.annotated.on_usable_pose()
     node.annotated.show(Shown(GREY_IMAGE), fresh)
     bench.spin_until(lambda: pictures[-1].header.stamp == fresh)
     assert frame(pictures[-1]) == [90, 90, 90]
@@ -222,7 +222,7 @@ def test_diagnostics_say_once_that_poses_stay_away_and_that_they_are_back(bench,
     bench.spin_until(lambda: node.health.values.get("probe_pose") == "waiting")
     assert node.health.problems("pose age") == 0
     for times in (1, 2):
-        node.annotated.pose_came()
+        node.annotated.on_usable_pose()
         bench.spin_until(lambda: node.health.values["probe_pose"] == "live")
         bench.spin_until(lambda: node.health.values["probe_pose"] == "lost")
         assert node.health.problems("pose age") == times
@@ -235,7 +235,7 @@ def test_poses_of_another_clock_are_live_when_they_come_and_missed_when_they_do_
     node = show(stale_after=0.5, lost_after=60.0)
     pictures = subscribed(bench, node)
     stamp = node.stamp(age)
-    node.annotated.pose_came()
+    node.annotated.on_usable_pose()
     node.annotated.show(Shown(GREY_IMAGE), stamp)
     assert node.annotated.state == "live"
     bench.spin_until(lambda: pictures and pictures[-1].header.stamp == stamp)
@@ -246,7 +246,7 @@ def test_poses_of_another_clock_are_live_when_they_come_and_missed_when_they_do_
 def test_setting_the_clock_makes_no_pose_old(show):
     node = show(stale_after=10.0)
     for simulated in (True, False):  # to 1970, and back to the present
-        node.annotated.pose_came()
+        node.annotated.on_usable_pose()
         assert node.set_parameters([Parameter("use_sim_time", value=simulated)])[0].successful
         assert node.annotated.state == "live"
 
@@ -255,11 +255,11 @@ def test_an_image_that_lags_behind_live_poses_is_marked(bench, show):
     node = show(stale_after=0.5, lost_after=60.0)
     pictures = subscribed(bench, node)
     first = node.stamp()
-    node.annotated.pose_came()
+    node.annotated.on_usable_pose()
     node.annotated.show(Shown(GREY_IMAGE), first)
 
     def is_marked():
-        node.annotated.pose_came()
+        node.annotated.on_usable_pose()
         return pictures and frame(pictures[-1]) == AMBER
 
     bench.spin_until(is_marked)
@@ -269,7 +269,7 @@ def test_an_image_that_lags_behind_live_poses_is_marked(bench, show):
 
 def test_the_limits_change_while_running(bench, show):
     node = show(stale_after=30.0)
-    node.annotated.pose_came()
+    node.annotated.on_usable_pose()
     assert node.annotated.state == "live"
     assert node.set_parameters([Parameter("stale_after", value=0.01)])[0].successful
     bench.spin_until(lambda: node.annotated.state == "stale")
@@ -285,7 +285,7 @@ def test_in_lockstep_nothing_ages(bench, show):
     assert not pictures
     for second in (1, 2):  # 1970
         stamp = pose_at(0.0, second).header.stamp
-        node.annotated.pose_came()
+        node.annotated.on_usable_pose()
         node.annotated.show(Shown(GREY_IMAGE), stamp)
     bench.spin_until(lambda: len(pictures) == 2)
     bench.spin_for(40)

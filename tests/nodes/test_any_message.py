@@ -30,9 +30,9 @@ from us_sim.nodes.image_writer import ImageWriter
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.nodes.tf import TFMessage
-from us_sim.nodes.tracker_inputs.camera_input import camera_from
+from us_sim.nodes.tracker_inputs.camera_input import camera_model_from
 from us_sim.recording import decoding
-from us_sim.scene.building import tissue_model_of, volume_of
+from us_sim.scene.building import build_tissue_model, load_volume
 from us_sim.scene.reading import load_scene
 from us_sim.tracking.camera.encodings import decode_image, decompress_image
 from us_sim.tracking.haptic import ContactModel
@@ -94,7 +94,7 @@ GOOD = [
         partial(decompress_image, colours="GRAY"),
         CompressedImage(format="png", data=array("B", b"\x89PNG\r\n")),
     ),
-    (camera_from, camera_info()),
+    (camera_model_from, camera_info()),
 ]
 
 
@@ -219,7 +219,7 @@ def test_no_message_of_any_source_ends_the_tracker(bench, small_scene, tmp_path,
 
 def test_no_mesh_and_no_pose_end_the_slicing(bench, small_scene):
     scene = load_scene(small_scene)
-    mesh = tissue_model_of(scene, volume_of(scene)).mesh
+    mesh = build_tissue_model(scene, load_volume(scene)).mesh
     node = bench.make(SliceInterpolator, scene=str(small_scene))
     images = bench.collect(Image, "ultrasound/image")
     bench.collect(Image, "ultrasound/image_annotated")

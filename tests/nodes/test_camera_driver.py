@@ -14,7 +14,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from us_sim.errors import TrackingError, UsSimError
 from us_sim.nodes.camera_driver import CameraDriver
-from us_sim.nodes.tracker_inputs.camera_input import camera_from
+from us_sim.nodes.tracker_inputs.camera_input import camera_model_from
 from us_sim.tracking.camera.encodings import decode_image
 from us_sim.tracking.camera.model import CameraModel, write_camera_info
 
@@ -64,7 +64,7 @@ def test_a_video_is_played_at_its_own_rate_with_its_calibration_and_ends(
         assert image.encoding == encoding
         expected = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
         np.testing.assert_array_equal(decode_image(image, "GRAY"), expected)
-    camera = camera_from(infos[0])
+    camera = camera_model_from(infos[0])
     assert (camera.width, camera.height) == (640, 480)
     np.testing.assert_array_equal(camera.matrix, [[600, 0, 320], [0, 610, 240], [0, 0, 1]])
     np.testing.assert_array_equal(camera.distortion, [-0.1, 0.02, 0, 0, 0])
@@ -84,7 +84,7 @@ def test_a_looping_video_goes_on_and_the_latency_makes_stamps_earlier(bench, vid
     age = node.get_clock().now().nanoseconds - stamps[-1]
     assert 5.0e9 <= age < 10e9
     with pytest.raises(TrackingError, match="not calibrated"):
-        camera_from(infos[0])
+        camera_model_from(infos[0])
 
 
 class PaperCamera:

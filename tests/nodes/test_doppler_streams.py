@@ -16,7 +16,13 @@ from us_sim.errors import ProbeError, SceneError
 from us_sim.nodes.messages import cloud_message, tetrahedra_message
 from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.recording.decoding import field_from, pose_from
-from us_sim.scene.building import blood_of, probe_of, scanner_of, tissue_model_of, volume_of
+from us_sim.scene.building import (
+    build_blood,
+    build_probe,
+    build_scanner,
+    build_tissue_model,
+    load_volume,
+)
 from us_sim.scene.reading import load_scene
 from us_sim.slicing.flow.doppler import ColourDoppler
 
@@ -45,7 +51,7 @@ def scene(tmp_path, small_scene):
 @pytest.fixture
 def arm(scene):
     made = load_scene(scene)
-    return tissue_model_of(made, volume_of(made)).mesh
+    return build_tissue_model(made, load_volume(made)).mesh
 
 
 def cloud(points, pose):
@@ -92,19 +98,25 @@ def test_velocities_are_those_of_the_domain_at_the_poses_stamp(bench, scene, arm
         pose(second)
     bench.spin_until(lambda: all(len(messages) == 2 for messages in collected.values()))
     made = load_scene(scene)
-    volume = volume_of(made)
-    scanner, blood, probe = scanner_of(made, volume), blood_of(made, volume), probe_of(made)
+    volume = load_volume(made)
+    scanner, blood, probe = (
+        build_scanner(made, volume),
+        build_blood(made, volume),
+        build_probe(made),
+    )
     rest = arm.nodes.astype(np.float32).astype(np.float64)
-    scanner.carry(rest, arm.tetrahedra)
+    scanner.attach_mesh(rest, arm.tetrahedra)
     doppler = ColourDoppler(probe, made.colour)
     for k, second in enumerate((7, 8)):
-        frame = scanner.frame(pose_from(tilted(second)), rest, time=float(second))
+        frame = scanner.make_frame(pose_from(tilted(second)), rest, time=float(second))
         truth, estimate = (collected[name][k] for name in TOPICS[:2])
         assert (truth.encoding, truth.header.stamp.sec, truth.header.frame_id) == (
             "32FC1", second, "probe",
         )  # fmt: skip
-        np.testing.assert_array_equal(field_from(truth), doppler.truth(blood, frame))
-        np.testing.assert_array_equal(field_from(estimate), doppler.estimate(blood, frame))
+        np.testing.assert_array_equal(
+            field_from(truth), doppler.compute_true_velocity(blood, frame)
+        )
+        np.testing.assert_array_equal(field_from(estimate), doppler.estimate_velocity(blood, frame))
     assert np.nanmax(np.abs(field_from(collected["velocity"][0]))) > 0.03
     for name in ("spectrum", "m_mode"):
         last = collected[name][-1]

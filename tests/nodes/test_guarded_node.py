@@ -137,7 +137,7 @@ def test_what_ends_a_node_still_does(broken):
     for ending in (KeyboardInterrupt, ExternalShutdownException, SystemExit):
         broken.error = ending()
         with pytest.raises(ending):
-            broken.guarded("here", broken.work)()
+            broken.guard_callback("here", broken.work)()
     assert not broken.failures
 
 

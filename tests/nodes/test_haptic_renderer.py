@@ -18,8 +18,8 @@ from us_sim.nodes.haptic_renderer import HapticRenderer, PeriodicThread
 from us_sim.nodes.messages import (
     contact_model_from,
     contact_model_message,
+    serialize_wrench,
     wrench_message,
-    wrench_serialized,
 )
 from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.recording.decoding import pose_from
@@ -186,7 +186,7 @@ def test_a_model_survives_its_message():
 @pytest.mark.parametrize("frame", ["", "arm"])
 def test_a_wrench_written_by_hand_is_the_message(frame):
     wrench = np.array([1.0, -2.0, 3.5, 1e-9, 0.0, -7.25])
-    written = wrench_serialized(wrench, 1_234_567_890_123_456_789, frame)
+    written = serialize_wrench(wrench, 1_234_567_890_123_456_789, frame)
     stamp = Time(nanoseconds=1_234_567_890_123_456_789).to_msg()
     message = wrench_message(wrench[:3], wrench[3:], stamp, frame)
     assert deserialize_message(written, WrenchStamped) == message

@@ -17,7 +17,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from us_sim.errors import MeshError, MessageError, PoseError, ProbeError, StampError, VolumeError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.messages import (
-    Shape,
+    MarkerShape,
     affine_message,
     cloud_message,
     image_message,
@@ -29,12 +29,12 @@ from us_sim.nodes.messages import (
 )
 from us_sim.recording.decoding import (
     affine_from,
-    first_stamp_in,
     mesh_from,
     nanoseconds_of,
     pixels_from,
     pose_from,
     pose_from_text,
+    read_first_stamp,
     tetrahedra_from,
     triangles_from,
     vectors_from,
@@ -196,7 +196,7 @@ def test_structure_markers_are_what_rclpy_would_serialize(surfaces, frame):
         random = np.random.default_rng(seed)
         triangles = random.integers(0, len(vertices), (count, 3))
         colour = (0.25, 0.5, 0.75, 1.0)
-        given_ones.append(Shape(name, colour, vertices[triangles.ravel()]))
+        given_ones.append(MarkerShape(name, colour, vertices[triangles.ravel()]))
         marker = Marker(ns=name, type=Marker.TRIANGLE_LIST, action=Marker.ADD)
         marker.header.stamp, marker.header.frame_id = STAMP, frame
         marker.scale.x = marker.scale.y = marker.scale.z = marker.pose.orientation.w = 1.0
@@ -207,7 +207,7 @@ def test_structure_markers_are_what_rclpy_would_serialize(surfaces, frame):
     # Not byte for byte: what fills the gaps between numbers is up to the middleware.
     assert len(serialized) == len(serialize_message(expected))
     assert deserialize_message(serialized, MarkerArray) == expected
-    assert first_stamp_in(serialized) == (nanoseconds_of(STAMP) if given_ones else None)
+    assert read_first_stamp(serialized) == (nanoseconds_of(STAMP) if given_ones else None)
 
 
 @quick

@@ -17,14 +17,14 @@ from us_sim.errors import UsSimError
 from us_sim.nodes.settings import (
     NODES,
     SessionControlSettings,
-    checked_parameters,
+    check_parameters,
     is_live,
     parameters_of,
 )
 from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.run.plan import NodeProcess
 from us_sim.scene.reading import load_scene
-from us_sim.settings.quantity import dial_unit
+from us_sim.settings.quantity import choose_dial_unit
 from us_sim.settings.setting import Settings, kinds_of, rules_of
 from us_sim.share import shared_path
 from us_sim.tissue import live_tissue
@@ -102,7 +102,9 @@ def test_every_setting_is_shown_and_only_what_may_change_can_be_set(bench, scene
         told = json.loads(shown.additional_constraints)
         assert rule.description, parameter
         assert shown.description == rule.description
-        unit, dial = (rule.quantity.unit, dial_unit(rule.quantity)) if rule.quantity else ("", "")
+        unit, dial = (
+            (rule.quantity.unit, choose_dial_unit(rule.quantity)) if rule.quantity else ("", "")
+        )
         assert (told.get("unit", ""), told.get("shown_in", "")) == (unit, dial)
         assert told["live"] is is_live(settings, field)
         assert tuple(told.get("choices", ())) == (
@@ -207,7 +209,7 @@ def test_a_solver_s_setting_reaches_it(pressed):
 
 
 def test_tissue_twice_as_stiff_pushes_twice_as_hard_once_it_is_ready(pressed, monkeypatch):
-    go, make = threading.Event(), live_tissue.compiled_solver
+    go, make = threading.Event(), live_tissue.compile_solver
     node, press = pressed()
     force = press()
     assert force < 0
@@ -217,7 +219,7 @@ def test_tissue_twice_as_stiff_pushes_twice_as_hard_once_it_is_ready(pressed, mo
         assert go.wait(60)
         return make(*given)
 
-    monkeypatch.setattr(live_tissue, "compiled_solver", slowly)
+    monkeypatch.setattr(live_tissue, "compile_solver", slowly)
     materials = [
         name for name in node.get_parameters_by_prefix("materials") if "young_modulus" in name
     ]
@@ -290,7 +292,7 @@ def test_what_is_set_back_may_be_what_two_settings_say_together(bench, pressed):
     ],
 )
 def test_parameters_of_the_command_line_have_units(scene, node, given, checked):
-    made = checked_parameters(node, load_scene(scene), given)
+    made = check_parameters(node, load_scene(scene), given)
     assert made == checked
     assert [type(value) for value in made.values()] == [type(value) for value in checked.values()]
 
@@ -310,4 +312,4 @@ def test_parameters_of_the_command_line_have_units(scene, node, given, checked):
 )
 def test_a_wrong_parameter_of_the_command_line_is_one_sentence(scene, node, given, fact):
     with pytest.raises(UsSimError, match=rf"\A--param {node}\..*{fact}.*\Z"):
-        checked_parameters(node, load_scene(scene), given)
+        check_parameters(node, load_scene(scene), given)

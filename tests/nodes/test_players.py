@@ -200,7 +200,7 @@ def damaged(tmp_path):
     with BagWriter(file, chunk_size=500) as bag:
         bag.add_topic("/said", "std_msgs/msg/String")
         for k in range(100):
-            bag.write("/said", bytes(serialize_message(String(data=f"{k:03}"))), EPOCH + k)
+            bag.write_message("/said", bytes(serialize_message(String(data=f"{k:03}"))), EPOCH + k)
     with file.open("rb") as stream:
         chunk = make_reader(stream).get_summary().chunk_indexes[1]
     content = bytearray(file.read_bytes())
@@ -237,7 +237,7 @@ def test_a_recording_is_published_as_it_was(bench, shared_data):
     latched = bench.collect(Int32MultiArray, "/tissue/tetrahedra", latched=True)
     bench.spin_until(player.finished.done)
     bag = read_bag(folder)
-    expected = [bag.deserialize(m) for m in bag.messages(["/tracker/pose"])]
+    expected = [bag.deserialize(m) for m in bag.read_messages(["/tracker/pose"])]
     bench.spin_until(lambda: len(poses) == len(expected) and latched)
     for received, recorded in zip(poses, expected, strict=True):
         assert received.pose.position.z == recorded.pose.position.z
@@ -284,8 +284,8 @@ def test_a_recording_is_paused_gone_along_and_ends_when_it_may(bench, tmp_path):
         bag.add_topic("/excluded", "std_msgs/msg/String")
         for k in range(10):
             data = bytes(serialize_message(String(data=str(k))))
-            bag.write("/said", data, EPOCH + k * 10**9)
-            bag.write("/excluded", data, EPOCH + k * 10**9)
+            bag.write_message("/said", data, EPOCH + k * 10**9)
+            bag.write_message("/excluded", data, EPOCH + k * 10**9)
     said = bench.collect(String, "/said")
     player = bench.make(
         SessionPlayer, path=str(file), paused=True, stay=True, exclude=["/excluded"]
@@ -323,7 +323,9 @@ def said_bag(tmp_path):
     with BagWriter(file) as bag:
         bag.add_topic("/said", "std_msgs/msg/String")
         for k in range(10):
-            bag.write("/said", bytes(serialize_message(String(data=str(k)))), EPOCH + k * STEP)
+            bag.write_message(
+                "/said", bytes(serialize_message(String(data=str(k)))), EPOCH + k * STEP
+            )
     return file
 
 

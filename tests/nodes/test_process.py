@@ -11,7 +11,7 @@ import pytest
 
 from us_sim.nodes import announce_often, process
 from us_sim.nodes.probe_tracker import ProbeTracker
-from us_sim.nodes.process import go_first
+from us_sim.nodes.process import raise_priority
 from us_sim.share import find_bag
 
 
@@ -72,9 +72,9 @@ def test_who_may_not_goes_on_as_before(monkeypatch):
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse, raising=False)
-    assert go_first() == "ordinary"
+    assert raise_priority() == "ordinary"
     monkeypatch.delattr(os, "sched_setscheduler")
-    assert go_first() == "ordinary"
+    assert raise_priority() == "ordinary"
 
 
 @pytest.mark.parametrize(
@@ -86,8 +86,10 @@ def test_a_node_asks_for_it_and_says_what_it_got(
 ):
     node = bench.make(ProbeTracker, scene=str(small_scene), **parameters)
     times = []
-    monkeypatch.setattr(process, "go_first", lambda priority: times.append(priority) or "realtime")
-    monkeypatch.setattr(process, "spin", lambda _: None)
+    monkeypatch.setattr(
+        process, "raise_priority", lambda priority: times.append(priority) or "realtime"
+    )
+    monkeypatch.setattr(process, "spin_node", lambda _: None)
     monkeypatch.setattr(process.rclpy, "init", lambda **_: None)
     monkeypatch.setattr(process.rclpy, "try_shutdown", lambda: None)
     monkeypatch.setattr(node, "destroy_node", lambda: None)

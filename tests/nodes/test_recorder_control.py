@@ -24,12 +24,12 @@ from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.session_recorder import SessionRecorder
 from us_sim.nodes.sessions.recorded_topic import RecordedTopic
-from us_sim.recording.attached_files import extract
+from us_sim.recording.attached_files import extract_files
 from us_sim.recording.path import ProbePath, write_path
 from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import DEFAULT_QOS
 from us_sim.recording.writer import BagWriter, PatientFile
-from us_sim.scene.building import path_of
+from us_sim.scene.building import load_path
 from us_sim.scene.reading import load_scene
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -57,7 +57,7 @@ def texts(file, topic="/note"):
     bag = read_bag(file)
     if topic not in {each.name for each in bag.topics}:
         return []
-    return [bag.deserialize(message).data for message in bag.messages([topic])]
+    return [bag.deserialize(message).data for message in bag.read_messages([topic])]
 
 
 def say(bench, recorder, publisher, *words):
@@ -143,7 +143,7 @@ def test_a_session_can_be_made_again_from_its_file(bench, tmp_path):
     end(bench, recorder)
     scene_text = scene.read_text()
     scene.unlink()
-    made = {path.name: path for path in extract(file, tmp_path / "again")}
+    made = {path.name: path for path in extract_files(file, tmp_path / "again")}
     assert made["info.yaml"].read_text() == "image_width: 640\n"
     given = yaml.safe_load(made["parameters.yaml"].read_text())
     assert given == {"tissue_deformer": {"ros__parameters": {"solver": "fem"}}}
@@ -173,17 +173,19 @@ def test_the_bag_that_was_played_is_attached_whole(bench, tmp_path, small_scene,
     )
     file, path = tmp_path / "session.mcap", played and str(tmp_path / played)
     end(bench, bench.make(SessionRecorder, file=str(file), scene=str(scene), path=path or ""))
-    extract(file, tmp_path / "again")
+    extract_files(file, tmp_path / "again")
     again = load_scene(tmp_path / "again" / "scene.yaml")
     kept = tmp_path / "again" / (played or "own")
     assert again.path == again.tracker.file == str(kept)
-    assert list(read_bag(kept).messages()) == list(read_bag(other if played else own).messages())
+    assert list(read_bag(kept).read_messages()) == list(
+        read_bag(other if played else own).read_messages()
+    )
     assert not read_bag(kept).fault
     session = bag_of(tmp_path / "probe", "patient", 0.03, "/probe/pose")
-    assert path_of(again, session).frame_id == "patient"  # the probe's own
+    assert load_path(again, session).frame_id == "patient"  # the probe's own
     elsewhere = bag_of(tmp_path / "elsewhere", "moon")
     with pytest.raises(BagError, match=r"'moon'.*'ndi'"):
-        path_of(again, elsewhere)
+        load_path(again, elsewhere)
 
 
 @pytest.mark.slow
@@ -207,7 +209,7 @@ def test_of_a_large_attachment_there_is_the_checksum(bench, tmp_path):
     large.write_bytes(bytes(5 << 20))
     file = tmp_path / "a.mcap"
     end(bench, bench.make(SessionRecorder, file=str(file), attach=[str(large)]))
-    made = {path.name: path for path in extract(file, tmp_path / "out")}
+    made = {path.name: path for path in extract_files(file, tmp_path / "out")}
     checksum = hashlib.sha256(bytes(5 << 20)).hexdigest()
     assert made["files.txt"].read_text() == f"{checksum}  {large}\n"
     assert large.name not in made
@@ -216,7 +218,7 @@ def test_of_a_large_attachment_there_is_the_checksum(bench, tmp_path):
 @pytest.fixture
 def may_write(monkeypatch):
     allowed = threading.Event()
-    write = BagWriter.write
+    write = BagWriter.write_message
     monkeypatch.setattr(
         BagWriter, "write", lambda *arguments: (allowed.wait(30), write(*arguments))
     )
@@ -236,7 +238,7 @@ def test_losses_are_told(bench, quiet, may_write):
         may_write.set()
     end(bench, recorder)
     assert 0 < len(texts(file)) < 10
-    assert read_bag(file).lost() == {"/note": 30 - len(texts(file))}
+    assert read_bag(file).count_losses() == {"/note": 30 - len(texts(file))}
     assert recorder.health.dropped == 30 - len(texts(file))
 
 
@@ -276,7 +278,7 @@ def test_what_a_publisher_overwrites_before_it_was_sent_is_counted(bench, tmp_pa
     assert flood.returncode == 0
     assert texts(file)[-1] == "last"
     assert 2 < len(texts(file)) < 302
-    assert read_bag(file).lost() == {"/note": 302 - len(texts(file))}
+    assert read_bag(file).count_losses() == {"/note": 302 - len(texts(file))}
 
 
 @pytest.mark.slow
@@ -324,12 +326,12 @@ def test_gaps_in_a_publishers_numbers_are_losses(bench):
     assert lost == [("/note", 2), ("/note", 7)]
     for number in (1, 21, 2, 22):  # somebody else has begun, of whom the graph does not tell yet
         topic._receive(b"", {"source_timestamp": 0, "publication_sequence_number": number})
-    topic.follow([DEFAULT_QOS])  # and has ended again
+    topic.adopt_offers([DEFAULT_QOS])  # and has ended again
     for number in (30, 32):
         topic._receive(b"", {"source_timestamp": 0, "publication_sequence_number": number})
     assert lost.pop() == ("/note", 1)
     assert len(lost) == 2
-    topic.follow([DEFAULT_QOS, DEFAULT_QOS])  # whose numbers cannot be told apart
+    topic.adopt_offers([DEFAULT_QOS, DEFAULT_QOS])  # whose numbers cannot be told apart
     for number in (30, 1, 31):
         topic._receive(b"", {"source_timestamp": 0, "publication_sequence_number": number})
     assert len(lost) == 2
@@ -386,7 +388,7 @@ def test_a_full_disk_is_said_and_survived(bench, quiet, monkeypatch):
     say(bench, recorder, note, "three")
     end(bench, recorder)
     assert texts(file) == ["one", "two", "three"]
-    assert not read_bag(file).lost()
+    assert not read_bag(file).count_losses()
 
 
 def test_a_message_is_recorded_with_the_time_at_which_it_came(bench, tmp_path):
@@ -398,5 +400,5 @@ def test_a_message_is_recorded_with_the_time_at_which_it_came(bench, tmp_path):
     note.publish(String(data="two"))
     time.sleep(1.0)
     recorder.destroy_node()
-    _, late = read_bag(file).messages()
+    _, late = read_bag(file).read_messages()
     assert 0 <= late.log_time - late.publish_time < 5 * 10**8

@@ -15,7 +15,7 @@ from us_sim.errors import ScoreError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.messages import image_message, wrench_message
 from us_sim.nodes.scorer import Scorer
-from us_sim.scene.building import scanner_of, volume_of
+from us_sim.scene.building import build_scanner, load_volume
 from us_sim.scene.reading import load_scene
 from us_sim.scoring.result_place import KEPT_FOLDER
 
@@ -33,7 +33,7 @@ def node(bench, small_scene, tmp_path):
 def scanned(bench, node, small_scene):
     """Eleven seconds at 10 mm/s and 5 N, and the vein's labels, half of them gone from 5 s on."""
     scene = load_scene(str(small_scene))
-    labels = scanner_of(scene, volume_of(scene)).labels(Pose())
+    labels = build_scanner(scene, load_volume(scene)).render_labels(Pose())
     rows = np.flatnonzero((labels == VEIN).any(axis=1))
     half = labels.copy()
     half[rows[: len(rows) // 2]] = 3

@@ -10,7 +10,7 @@ from us_sim.nodes.session_monitor import TOLD, SessionMonitor
 from us_sim.nodes.settings import SessionControlSettings
 from us_sim.scene.listing import ListedScene
 from us_sim.viewer.session import NOT_THERE, ViewerSession
-from us_sim.viewer.stream import Posted
+from us_sim.viewer.stream import CallPoster
 
 
 class Simulation:
@@ -78,10 +78,10 @@ def test_what_is_so_is_shown_without_being_asked_for(bench):
 def test_pages_follow_and_ask_and_hear_why_not(bench):
     control, simulation = controlled(bench)
     page = bench.add(GuardedNode("page", context=bench.context))
-    session = ViewerSession(page, Posted(page))
+    session = ViewerSession(page, CallPoster(page))
     board = session
-    assert board.ask(record="a.mcap").result() == NOT_THERE
-    board.watch()
+    assert board.ask_control(record="a.mcap").result() == NOT_THERE
+    board.add_page()
     bench.spin_until(lambda: control.count_subscribers("session/scenes"))
     arm = ListedScene("arm", "/arm.yaml", description="An arm.", structures=("vein", "artery"))
     control.tell_scenes([arm, ListedScene("leg", "/leg.yaml", problem="volume: is missing")])
@@ -104,11 +104,11 @@ def test_pages_follow_and_ask_and_hear_why_not(bench):
     assert board.state.problem == "nothing came"
     assert board.state.record_note == "it lies beside another"
     bench.spin_until(lambda: session._client.services_are_ready())
-    taken, refused = board.ask(record="b.mcap"), board.ask(scene="nowhere")
+    taken, refused = board.ask_control(record="b.mcap"), board.ask_control(scene="nowhere")
     bench.spin_until(lambda: taken.done() and refused.done())
     assert (taken.result(), refused.result()) == ("", "there is no scene file nowhere")
     assert simulation.taken[-1][1].record == "b.mcap"
-    board.unwatch()
+    board.remove_page()
     bench.spin_until(lambda: not control.count_subscribers("session/scenes"))
 
 

@@ -37,13 +37,13 @@ def test_what_is_published_is_recorded_as_it_was(bench, tmp_path):
     recorder.destroy_node()
     bag = read_bag(file)
     assert not bag.fault
-    messages = list(bag.messages(["/tracker/pose"]))
+    messages = list(bag.read_messages(["/tracker/pose"]))
     assert [deserialize_message(bytes(m.data), PoseStamped) for m in messages] == sent
     assert {len(m.data) for m in messages} == {len(serialize_message(sent[0]))}
-    assert bag.topic("/early").message_count == 1
-    assert bag.topic("/early").qos[0].durability == QosDurability.TRANSIENT_LOCAL
-    assert bag.topic("/ultrasound/image").qos[0].reliability == QosReliability.BEST_EFFORT
-    for message in bag.messages():
+    assert bag.find_topic("/early").message_count == 1
+    assert bag.find_topic("/early").qos[0].durability == QosDurability.TRANSIENT_LOCAL
+    assert bag.find_topic("/ultrasound/image").qos[0].reliability == QosReliability.BEST_EFFORT
+    for message in bag.read_messages():
         assert message.publish_time <= message.log_time
 
 

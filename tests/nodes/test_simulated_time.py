@@ -153,7 +153,7 @@ def test_a_recorder_begins_when_simulated_time_does(bench, tmp_path):
     said.publish(String(data="yes"))
     bench.spin_until(lambda: recorder.health.received)
     recorder.stop()
-    assert [message.log_time for message in read_bag(file).messages()] == [EPOCH]
+    assert [message.log_time for message in read_bag(file).read_messages()] == [EPOCH]
 
 
 def test_a_player_that_follows_a_clock_goes_on_when_that_is_set_back(bench, tmp_path):

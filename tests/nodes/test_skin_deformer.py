@@ -13,7 +13,7 @@ from visualization_msgs.msg import Marker
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.skin_deformer import SkinDeformer
 from us_sim.recording.decoding import vectors_from
-from us_sim.scene.building import membrane_of
+from us_sim.scene.building import build_membrane
 from us_sim.scene.reading import load_scene
 
 
@@ -28,7 +28,7 @@ def test_vertices_normals_marker_and_latched_mesh(bench, small_scene):
         bench.spin_until(lambda topic=topic: bench.peer.count_publishers(topic) > 0)
     publisher.publish(pose_at(0.006, 5))
     bench.spin_until(lambda: clouds and markers)
-    membrane = membrane_of(load_scene(small_scene))
+    membrane = build_membrane(load_scene(small_scene))
     expected = membrane.deform(Pose([0.0, 0.0, 0.006], [0.0, 0.0, 0.0, 1.0]))
     assert clouds[0].header.stamp.sec == 5
     assert [field.name for field in clouds[0].fields] == [
@@ -75,6 +75,6 @@ def test_the_membrane_may_change_while_it_is_pressed(bench, small_scene):
     bench.spin_until(lambda: len(clouds) == 2)
     scene = load_scene(small_scene)
     settings = replace(scene.skin, anchor_stiffness=1.0, prestrain=0.4)
-    expected = membrane_of(scene, settings).deform(Pose([0.0, 0.0, 0.006], [0.0, 0.0, 0.0, 1.0]))
+    expected = build_membrane(scene, settings).deform(Pose([0.0, 0.0, 0.006], [0.0, 0.0, 0.0, 1.0]))
     np.testing.assert_allclose(vectors_from(clouds[1]), expected.vertices, atol=1e-7)
     assert np.abs(vectors_from(clouds[1]) - vectors_from(clouds[0])).max() > 1e-4

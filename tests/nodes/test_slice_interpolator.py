@@ -14,7 +14,7 @@ from std_msgs.msg import Float64MultiArray, Int32MultiArray
 from us_sim.nodes.messages import cloud_message, tetrahedra_message
 from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.recording.decoding import affine_from, pixels_from, pose_from
-from us_sim.scene.building import probe_of, skin_surface_of, tissue_model_of, volume_of
+from us_sim.scene.building import build_probe, build_tissue_model, load_skin_surface, load_volume
 from us_sim.scene.reading import load_scene
 from us_sim.slicing.cutting.resampling import sample_plane
 from us_sim.slicing.cutting.slicer import create_slicer
@@ -37,7 +37,7 @@ def cloud(points, pose):
 def slicer(bench, small_scene):
     node = bench.make(SliceInterpolator, scene=str(small_scene), lockstep=True)
     scene = load_scene(small_scene)
-    mesh = tissue_model_of(scene, volume_of(scene)).mesh
+    mesh = build_tissue_model(scene, load_volume(scene)).mesh
     images = bench.collect(Image, "ultrasound/image")
     rest = bench.peer.create_publisher(PointCloud2, "tissue/rest", KEPT)
     tetrahedra = bench.peer.create_publisher(Int32MultiArray, "tissue/tetrahedra", KEPT)
@@ -54,7 +54,10 @@ def test_the_face_meets_the_skin_where_the_scene_has_one(bench, small_scene):
     file.write_text(small_scene.read_text() + "imaging: {contact: true}\n")
     node = bench.make(SliceInterpolator, scene=str(file), lockstep=True)
     scene = load_scene(file)
-    mesh, skin = tissue_model_of(scene, volume_of(scene)).mesh, skin_surface_of(scene).vertices
+    mesh, skin = (
+        build_tissue_model(scene, load_volume(scene)).mesh,
+        load_skin_surface(scene).vertices,
+    )
     images = bench.collect(Image, "ultrasound/image")
     bench.peer.create_publisher(PointCloud2, "tissue/rest", KEPT).publish(
         cloud(mesh.nodes, pose_at(0.0, 1))
@@ -93,8 +96,8 @@ def test_an_image_is_cut_at_the_pose_with_the_nodes_stamp(bench, slicer, small_s
     assert images[0].header.frame_id == "probe"
     scene = load_scene(small_scene)
     rest = mesh.nodes.astype(np.float32).astype(np.float64)
-    cutter = create_slicer("scan_conversion", volume_of(scene), rest, mesh.tetrahedra)
-    expected = cutter.image(moved, probe_of(scene).plane(pose_from(pose_at(0.003, 1))))
+    cutter = create_slicer("scan_conversion", load_volume(scene), rest, mesh.tetrahedra)
+    expected = cutter.cut_image(moved, build_probe(scene).make_plane(pose_from(pose_at(0.003, 1))))
     np.testing.assert_array_equal(pixels_from(images[0]), expected)
     assert expected.std() > 5  # there is something in the picture
 
@@ -131,8 +134,8 @@ def test_without_tissue_the_volume_is_cut_as_it_is(bench, tmp_path):
     poses.publish(pose_at(0.002, 9))
     bench.spin_until(lambda: images)
     scene = load_scene(file)
-    plane = probe_of(scene).plane(pose_from(pose_at(0.002, 9)))
-    np.testing.assert_array_equal(pixels_from(images[0]), sample_plane(volume_of(scene), plane))
+    plane = build_probe(scene).make_plane(pose_from(pose_at(0.002, 9)))
+    np.testing.assert_array_equal(pixels_from(images[0]), sample_plane(load_volume(scene), plane))
     assert "tissue/nodes" not in dict(bench.peer.get_topic_names_and_types())
 
 
@@ -199,7 +202,7 @@ def test_pixels_are_placed_in_millimetres_also_after_a_change_of_depth(bench, ri
     assert node.set_parameters([Parameter("depth", value=0.03)])[0].successful
     bench.spin_until(lambda: len(places) == 2)
     assert (affine_from(places[-1]) @ last)[2] == pytest.approx(30e-3 - 30e-3 / 100)
-    shallow = dataclasses.replace(probe_of(scene), depth=0.03)
-    plane = shallow.plane(pose_from(pose_at(0.002, 5)))
-    expected = sample_plane(volume_of(scene), plane)
+    shallow = dataclasses.replace(build_probe(scene), depth=0.03)
+    plane = shallow.make_plane(pose_from(pose_at(0.002, 5)))
+    expected = sample_plane(load_volume(scene), plane)
     np.testing.assert_array_equal(image_at(bench, images, poses, 5), expected)

@@ -28,32 +28,32 @@ def deflected(axis, value, *, first=1):
 @pytest.mark.parametrize("first", [1, 2], ids=["moved", "turned"])
 def test_axes_are_forward_left_and_up_and_turns_about_them(axis, published, first):
     reports = SpaceMouseReports()
-    assert reports.take(deflected(axis, -350, first=first))
+    assert reports.parse_report(deflected(axis, -350, first=first))
     expected = [0.0] * 6
     expected[published + 3 * (first == 2)] = 1.0
     assert reports.axes == expected
-    assert reports.take(deflected(axis, 700, first=first))
+    assert reports.parse_report(deflected(axis, 700, first=first))
     assert min(reports.axes) == -1.0
 
 
 def test_newer_devices_send_all_six_axes_at_once():
     reports = SpaceMouseReports()
-    assert reports.take(struct.pack("<B6h", 1, -35, -70, -105, -140, -175, -210))
+    assert reports.parse_report(struct.pack("<B6h", 1, -35, -70, -105, -140, -175, -210))
     assert reports.axes == pytest.approx([0.2, 0.1, 0.3, 0.5, 0.4, 0.6])
 
 
 def test_what_is_no_report_changes_nothing():
     reports = SpaceMouseReports()
     for report in (b"", b"\1", b"\1\0\0", b"\x17\x50", b"\3", bytes(64)):
-        assert not reports.take(report)
+        assert not reports.parse_report(report)
     assert reports.axes == [0.0] * 6
 
 
 def test_as_many_buttons_as_have_been_pressed():
     reports = SpaceMouseReports()
-    reports.take(struct.pack("<BI", 3, 1 << 12 | 1))
+    reports.parse_report(struct.pack("<BI", 3, 1 << 12 | 1))
     assert reports.buttons == [1] + [0] * 11 + [1]
-    reports.take(struct.pack("<BI", 3, 0))
+    reports.parse_report(struct.pack("<BI", 3, 0))
     assert reports.buttons == [0] * 13
 
 

@@ -12,9 +12,9 @@ from std_msgs.msg import Int32MultiArray
 from us_sim.nodes.messages import cloud_message, tetrahedra_message
 from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.recording.decoding import field_from, pose_from
-from us_sim.scene.building import scanner_of, tissue_model_of, volume_of
+from us_sim.scene.building import build_scanner, build_tissue_model, load_volume
 from us_sim.scene.reading import load_scene
-from us_sim.slicing.settings import Strain
+from us_sim.slicing.settings import StrainSettings
 from us_sim.slicing.strain import AxialStrain
 from us_sim.slicing.strain_estimate import estimate_strain
 
@@ -28,11 +28,11 @@ class Pressed:
         self.node = bench.make(SliceInterpolator, scene=str(scene), lockstep=True, **parameters)
         self.bench = bench
         loaded = load_scene(scene)
-        volume = volume_of(loaded)
-        self.rest = tissue_model_of(loaded, volume).mesh.nodes.astype(np.float32).astype(float)
-        tetrahedra = tissue_model_of(loaded, volume).mesh.tetrahedra
-        self.scanner = scanner_of(loaded, volume)
-        self.scanner.carry(self.rest, tetrahedra)
+        volume = load_volume(loaded)
+        self.rest = build_tissue_model(loaded, volume).mesh.nodes.astype(np.float32).astype(float)
+        tetrahedra = build_tissue_model(loaded, volume).mesh.tetrahedra
+        self.scanner = build_scanner(loaded, volume)
+        self.scanner.attach_mesh(self.rest, tetrahedra)
         self._latched = [
             bench.peer.create_publisher(PointCloud2, "tissue/rest", KEPT),
             bench.peer.create_publisher(Int32MultiArray, "tissue/tetrahedra", KEPT),
@@ -55,7 +55,7 @@ class Pressed:
 
     def frame(self, second):
         pose = pose_from(pose_at(1e-3 * second, second))
-        return self.scanner.frame(pose, self.nodes_at(second))
+        return self.scanner.make_frame(pose, self.nodes_at(second))
 
     def _cloud(self, points, pose):
         return cloud_message(dict(zip("xyz", points.T, strict=True)), pose.header.stamp, "patient")
@@ -70,11 +70,11 @@ def test_strain_since_rest_and_since_an_image_before(bench, pressed):
     node = pressed(**{"strain.interval": 2})
     images = bench.collect(Image, "ultrasound/strain")
     bench.spin_until(lambda: bench.peer.count_publishers("ultrasound/strain") > 0)
-    strain = AxialStrain.of(node.press(1))
+    strain = AxialStrain.from_frame(node.press(1))
     bench.spin_until(lambda: len(images) == 1)
     assert (images[0].encoding, images[0].header.frame_id) == ("32FC1", "probe")
     assert images[0].header.stamp.sec == 1
-    np.testing.assert_array_equal(field_from(images[0]), strain.image(node.frame(1)))
+    np.testing.assert_array_equal(field_from(images[0]), strain.compute_strain(node.frame(1)))
     assert np.nanmedian(field_from(images[0])) == pytest.approx(-0.02, abs=1e-4)
     result = node.node.set_parameters([Parameter("strain.since", value="image")])[0]
     assert result.successful
@@ -82,7 +82,7 @@ def test_strain_since_rest_and_since_an_image_before(bench, pressed):
     node.press(3)
     bench.spin_until(lambda: len(images) == 2)
     assert images[1].header.stamp.sec == 3
-    expected = strain.image(node.frame(3), node.nodes_at(1))
+    expected = strain.compute_strain(node.frame(3), node.nodes_at(1))
     np.testing.assert_array_equal(field_from(images[1]), expected)
     assert np.nanmedian(expected) == pytest.approx(0.94 / 0.98 - 1, abs=1e-4)
 
@@ -94,7 +94,7 @@ def test_the_estimate_is_made_of_two_images_and_only_for_its_subscribers(bench, 
     first, second = (node.press(number).pixels for number in (1, 2))
     bench.spin_until(lambda: estimates)
     assert len(estimates) == 1
-    settings = Strain(interval=1, window=0.006, search=0.002)
+    settings = StrainSettings(interval=1, window=0.006, search=0.002)
     expected = estimate_strain(first, second, node.scanner.probe, settings).strain
     np.testing.assert_array_equal(field_from(estimates[0]), expected)
     assert np.isfinite(expected).mean() > 0.5

@@ -18,7 +18,7 @@ from us_sim.nodes import tissue_deformer
 from us_sim.nodes.messages import contact_model_from
 from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.recording.decoding import tetrahedra_from, vectors_from
-from us_sim.scene.building import structures_of, tissue_model_of, volume_of
+from us_sim.scene.building import build_structures, build_tissue_model, load_volume
 from us_sim.scene.reading import load_scene
 from us_sim.tissue.solvers.solver import create_solver
 
@@ -46,7 +46,7 @@ def test_the_mesh_is_latched_for_who_comes_late(bench, small_scene):
     tetrahedra = bench.collect(Int32MultiArray, "tissue/tetrahedra", latched=True)
     bench.spin_until(lambda: rest and tetrahedra)
     scene = load_scene(small_scene)
-    mesh = tissue_model_of(scene, volume_of(scene)).mesh
+    mesh = build_tissue_model(scene, load_volume(scene)).mesh
     np.testing.assert_allclose(vectors_from(rest[0]), mesh.nodes, atol=1e-8)
     np.testing.assert_array_equal(tetrahedra_from(tetrahedra[0]), mesh.tetrahedra)
 
@@ -68,7 +68,7 @@ def test_nodes_are_the_solvers_and_carry_the_poses_stamp(bench, deformer, small_
     received = press(bench, publisher, nodes, 0.004, 3)
     assert nodes[-1].header.stamp.sec == 3
     scene = load_scene(small_scene)
-    solver = create_solver("fem", tissue_model_of(scene, volume_of(scene)))
+    solver = create_solver("fem", build_tissue_model(scene, load_volume(scene)))
     expected = solver.deform(Pose([0.0, 0.0, 0.004], [0.0, 0.0, 0.0, 1.0]))
     np.testing.assert_allclose(received, expected.nodes, atol=1e-7)
     bench.spin_until(lambda: wrenches)
@@ -154,9 +154,9 @@ def test_structures_are_where_the_tissue_has_carried_them(bench, scene_with_stru
     bench.spin_until(lambda: len(markers) >= 2)
     assert [m.markers[0].header.stamp.sec for m in markers] == [1, 3]  # a marker every two seconds
     scene = load_scene(scene_with_structures)
-    volume = volume_of(scene)
-    mesh = tissue_model_of(scene, volume).mesh
-    expected = list(structures_of(scene, volume, mesh, 5000))
+    volume = load_volume(scene)
+    mesh = build_tissue_model(scene, volume).mesh
+    expected = list(build_structures(scene, volume, mesh, 5000))
     total = sum(len(made.surface.triangles) for made in expected)
     assert total == pytest.approx(5000, rel=0.1)
     assert node.health.values["structures"] == f"vein, bone: {total} triangles"
@@ -254,7 +254,7 @@ def test_a_broken_pose_is_survived(bench, deformer):
 def test_a_method_that_cannot_be_is_refused_before_the_volume_is_made(
     bench, small_scene, monkeypatch, name, value, fact
 ):
-    monkeypatch.setattr(tissue_deformer, "volume_of", None)
+    monkeypatch.setattr(tissue_deformer, "load_volume", None)
     with pytest.raises(SettingsError, match=rf"^tissue_deformer\.{name}: {fact}"):
         bench.make(TissueDeformer, scene=str(small_scene), **{name: value})
 

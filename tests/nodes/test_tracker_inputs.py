@@ -224,7 +224,7 @@ def image(pixels, encoding, second):
 
 @pytest.fixture(scope="module")
 def view():
-    return RenderedView(CAMERA, RigidBody.single("6X6_250", 3, 0.04)).render(SEEN, SHARP)
+    return RenderedView(CAMERA, RigidBody.create_single("6X6_250", 3, 0.04)).render(SEEN, SHARP)
 
 
 SECTION = "{source: camera, camera: {dictionary: 6X6_250, marker: 3, size: 40 mm}}"

@@ -64,7 +64,7 @@ def kill_once(folder: Path, after: float, compression: str) -> float:
         lines = [first, *recorder.stdout]
     sent = [line.split() for line in lines if line.endswith("\n")]
     sent = {(topic, int(time)): int(k) for topic, k, time in sent}
-    there = {(m.topic, m.log_time): m.data for m in read_bag(file).messages()}
+    there = {(m.topic, m.log_time): m.data for m in read_bag(file).read_messages()}
     for (topic, time_ns), data in there.items():
         # The last message may have been put, and its line not printed any more.
         k = sent.get((topic, time_ns), max(sent.values(), default=0) + 1)

@@ -29,12 +29,12 @@ def write(file, frames):
             bag.add_topic(f"/topic_{k}", "std_msgs/msg/String", [DEFAULT_QOS])
         latched = DEFAULT_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL)
         bag.add_topic("/mesh", "std_msgs/msg/String", [latched])
-        bag.write("/mesh", TEXT, EPOCH)
+        bag.write_message("/mesh", TEXT, EPOCH)
         for frame in range(frames):
             at = EPOCH + frame * FRAME
             for k in range(TOPICS):
                 if (frame + k) % 2:  # one of each topic in a chunk is enough for its index
-                    bag.write(f"/topic_{k}", TEXT, at + k, at, frame)
+                    bag.write_message(f"/topic_{k}", TEXT, at + k, at, frame)
             if frame % 2:
                 bag.flush()
     return file
@@ -43,7 +43,7 @@ def write(file, frames):
 def measure(file):
     began = time.perf_counter(), time.process_time()
     bag = read_bag(file)
-    first = next(bag.messages())
+    first = next(bag.read_messages())
     opened = time.perf_counter() - began[0], time.process_time() - began[1]
     assert first.topic == "/mesh"
     length = bag.end - bag.start
@@ -51,8 +51,8 @@ def measure(file):
     for _ in range(200):
         at = bag.start + rng.randrange(length)
         began = time.process_time()
-        (mesh,) = bag.latest(["/mesh"], at, 10)
-        message = next(bag.messages(since=at))
+        (mesh,) = bag.read_latest(["/mesh"], at, 10)
+        message = next(bag.read_messages(since=at))
         seeks.append(time.process_time() - began)
         assert mesh == first
         assert 0 <= message.log_time - at < 2 * FRAME

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from us_sim.recording.schemas import jazzy_definitions, stamped
+from us_sim.recording.schemas import load_jazzy_definitions, serialize_stamped
 from us_sim.recording.writer import BagWriter
 
 EPOCH = 1_700_000_000_000_000_000
@@ -16,7 +16,7 @@ TYPES = {
     "/probe/wrench": "geometry_msgs/msg/WrenchStamped",
     "/ultrasound/image": "sensor_msgs/msg/Image",
 }
-T = jazzy_definitions().types
+T = load_jazzy_definitions().types
 
 
 def text(content):
@@ -29,12 +29,12 @@ def pose(stamp, z=0.0, x=0.0, w=1.0):
         position=T["geometry_msgs/msg/Point"](x, 0.0, z),
         orientation=T["geometry_msgs/msg/Quaternion"](0.0, 0.0, (1 - w * w) ** 0.5, w),
     )
-    return stamped(TYPES["/probe/pose"], stamp, "patient", pose=made)
+    return serialize_stamped(TYPES["/probe/pose"], stamp, "patient", pose=made)
 
 
 def cloud(stamp, nodes):
     field, nodes = T["sensor_msgs/msg/PointField"], np.asarray(nodes, "<f4")
-    return stamped(
+    return serialize_stamped(
         TYPES["/tissue/nodes"],
         stamp,
         "patient",
@@ -52,12 +52,12 @@ def cloud(stamp, nodes):
 def wrench(stamp, force):
     vector = T["geometry_msgs/msg/Vector3"]
     made = T["geometry_msgs/msg/Wrench"](force=vector(0.0, 0.0, force), torque=vector(0, 0, 0))
-    return stamped(TYPES["/probe/wrench"], stamp, "probe", wrench=made)
+    return serialize_stamped(TYPES["/probe/wrench"], stamp, "probe", wrench=made)
 
 
 def image(stamp, pixels):
     pixels = np.asarray(pixels, np.uint8)
-    return stamped(
+    return serialize_stamped(
         TYPES["/ultrasound/image"],
         stamp,
         "probe",
@@ -96,7 +96,7 @@ def write(file, messages, attach=()):
         for topic, kind in TYPES.items():
             bag.add_topic(topic, kind)
         for name, text in dict(attach).items():
-            bag.attach(name, "text/plain", text, EPOCH)
+            bag.attach_file(name, "text/plain", text, EPOCH)
         for topic, data, logged, sent, number in messages:
-            bag.write(topic, data, logged, sent, number)
+            bag.write_message(topic, data, logged, sent, number)
     return file

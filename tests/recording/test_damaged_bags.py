@@ -9,7 +9,7 @@ from session_files import EPOCH, STRING, text
 
 from us_sim.command.main import main
 from us_sim.errors import BagError
-from us_sim.recording.attached_files import extract
+from us_sim.recording.attached_files import extract_files
 from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import DEFAULT_QOS
 from us_sim.recording.writer import BagWriter
@@ -21,18 +21,18 @@ def session(tmp_path):
     file = tmp_path / "session.mcap"
     with BagWriter(file) as bag:
         bag.add_topic("/note", STRING, [DEFAULT_QOS._replace(depth=3)])
-        bag.attach("scene.yaml", "application/yaml", b"name: arm\n", EPOCH)
-        bag.attach("camera.yaml", "application/yaml", b"width: 640\n", EPOCH)
+        bag.attach_file("scene.yaml", "application/yaml", b"name: arm\n", EPOCH)
+        bag.attach_file("camera.yaml", "application/yaml", b"width: 640\n", EPOCH)
         bag.add_topic("/session/marker", STRING, [])
         for k in range(20):
-            bag.write("/note", text(f"{k}"), EPOCH + k * 10**8)
+            bag.write_message("/note", text(f"{k}"), EPOCH + k * 10**8)
             if k == 10:
                 bag.flush()
             if k == 5:
-                bag.write("/session/marker", text("needle in"), EPOCH + 5 * 10**8)
+                bag.write_message("/session/marker", text("needle in"), EPOCH + 5 * 10**8)
             if k == 15:
-                bag.note("messages_lost", {"/note": "2"})
-                bag.note("messages_lost", {"/note": "1"})
+                bag.write_metadata("messages_lost", {"/note": "2"})
+                bag.write_metadata("messages_lost", {"/note": "1"})
     return file
 
 
@@ -48,11 +48,13 @@ def test_a_cut_recording_is_read_as_far_as_it_goes(session):
     session.write_bytes(content[: content.index(b"messages_lost") + 200])
     cut = read_bag(session)
     assert "was not ended properly" in cut.fault
-    assert [m.log_time for m in cut.messages(["/note"])] == [EPOCH + k * 10**8 for k in range(11)]
+    assert [m.log_time for m in cut.read_messages(["/note"])] == [
+        EPOCH + k * 10**8 for k in range(11)
+    ]
     assert cut.message_count == 12  # in whole chunks
-    assert cut.topic("/note").qos == (DEFAULT_QOS._replace(depth=3),)
+    assert cut.find_topic("/note").qos == (DEFAULT_QOS._replace(depth=3),)
     assert cut.attachments.keys() == {"scene.yaml", "camera.yaml"}
-    assert cut.markers() == [(EPOCH + 5 * 10**8, "needle in")]
+    assert cut.read_markers() == [(EPOCH + 5 * 10**8, "needle in")]
 
 
 def test_a_damaged_chunk_is_left_out_and_said(session):
@@ -62,12 +64,12 @@ def test_a_damaged_chunk_is_left_out_and_said(session):
     content[first.chunk_start_offset + first.chunk_length - 3] ^= 1
     session.write_bytes(content)
     damage = []
-    assert [m.log_time for m in read_bag(session).messages(damage=damage)] == [
+    assert [m.log_time for m in read_bag(session).read_messages(damage=damage)] == [
         EPOCH + k * 10**8 for k in range(11, 20)
     ]
     assert re.search("is damaged in its chunk.*`mcap recover`", damage[0])
     with pytest.raises(BagError, match="is damaged in its chunk"):
-        list(read_bag(session).messages())
+        list(read_bag(session).read_messages())
 
 
 @pytest.mark.parametrize("at", [33, 60])
@@ -78,7 +80,7 @@ def test_without_an_index_a_damaged_chunk_is_left_out(session, at):
     content[second.chunk_start_offset + at] ^= 16
     session.write_bytes(content[: content.rindex(b"\x0f\x04")])
     bag = read_bag(session)
-    assert len(list(bag.messages())) == bag.message_count == 16
+    assert len(list(bag.read_messages())) == bag.message_count == 16
     assert "is damaged" in bag.fault
 
 
@@ -86,7 +88,7 @@ def test_an_attached_recording_that_is_cut_is_not_taken_for_the_recording(sessio
     file = tmp_path / "other.mcap"
     with BagWriter(file, sidecar=False) as bag:
         bag.add_topic("/other", STRING)
-        bag.attach("session.mcap", "application/octet-stream", session.read_bytes(), EPOCH)
+        bag.attach_file("session.mcap", "application/octet-stream", session.read_bytes(), EPOCH)
     content = file.read_bytes()
     for damaged in (
         content[: content.index(b"messages_lost") + 200],
@@ -101,9 +103,9 @@ def test_the_files_of_a_restarted_recorder_are_one_bag(session, tmp_path):
     session.write_bytes(content[: len(content) // 2])
     with BagWriter(session, further=True) as bag:
         bag.add_topic("/note", STRING)
-        bag.write("/note", text("later"), EPOCH + 10**10)
+        bag.write_message("/note", text("later"), EPOCH + 10**10)
     assert bag.path == tmp_path / "session_1.mcap"
-    assert len(list(read_bag(tmp_path).messages())) == 18
+    assert len(list(read_bag(tmp_path).read_messages())) == 18
 
 
 def test_the_commands(session, tmp_path, capsys):
@@ -120,14 +122,14 @@ def test_the_commands(session, tmp_path, capsys):
 @pytest.mark.parametrize(("name", "count"), [("talker", 20), ("topics_and_services", 13)])
 def test_all_of_a_foreign_database_is_read(shared_data, name, count):
     bag = read_bag(shared_data / f"foreign-files/{name}.db3")
-    assert len(list(bag.messages())) == bag.message_count == count
+    assert len(list(bag.read_messages())) == bag.message_count == count
 
 
 @pytest.mark.parametrize("name", ["", "..", "/etc/passwd", "c:\\x", "x\ny", None])
 def test_an_attachment_goes_nowhere_but_into_the_folder(tmp_path, name):
     with BagWriter(tmp_path / "bag.mcap") as bag:
         if name is not None:
-            bag.attach(name, "text/plain", b"harm", EPOCH)
+            bag.attach_file(name, "text/plain", b"harm", EPOCH)
     with pytest.raises(BagError, match="no files" if name is None else "not a file's name"):
-        extract(tmp_path / "bag.mcap", tmp_path / "out")
+        extract_files(tmp_path / "bag.mcap", tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -17,7 +17,7 @@ def session(path, compression="none", count=400):
             bag.add_topic(topic, STRING)
         for k in range(count):
             topic = "/rare" if k % 150 == 7 else "/b" if k % 5 == 0 else "/a"
-            bag.write(topic, HI + bytes([k % 256]), EPOCH + k * 10**7, EPOCH + k, k)
+            bag.write_message(topic, HI + bytes([k % 256]), EPOCH + k * 10**7, EPOCH + k, k)
     return path
 
 
@@ -67,20 +67,20 @@ def by_mcap(path):
 def test_everything_is_as_mcap_reads_it(tmp_path, name):
     path = FILES[name](tmp_path / "s.mcap")
     bag = read_bag(path)
-    assert [(m.topic, *m[2:]) for m in bag.messages()] == by_mcap(path)
+    assert [(m.topic, *m[2:]) for m in bag.read_messages()] == by_mcap(path)
 
 
 def test_messages_are_read_from_a_time_on_and_the_latest_before_it(file):
     bag = read_bag(file)
-    every = list(bag.messages())
+    every = list(bag.read_messages())
     rare, often = min((t for t in bag.topics), key=lambda t: t.message_count).name, every[0].topic
     times = [message.log_time for message in every]
     for since in (0, times[0], times[1] - 1, times[100], times[170], times[-1], times[-1] + 1):
         later = [m for m in every if m.log_time >= since]
-        assert list(bag.messages(since=since)) == later
-        assert list(bag.messages([rare], since=since)) == [m for m in later if m.topic == rare]
+        assert list(bag.read_messages(since=since)) == later
+        assert list(bag.read_messages([rare], since=since)) == [m for m in later if m.topic == rare]
         for count in (1, 3):
-            found = bag.latest([rare, often], since, count)
+            found = bag.read_latest([rare, often], since, count)
             for topic in {rare, often}:
                 earlier = [m for m in every if m.topic == topic and m.log_time < since]
                 assert [m for m in found if m.topic == topic] == earlier[-count:]
@@ -94,9 +94,9 @@ def test_seeking_reads_one_chunk(tmp_path, monkeypatch):
         mcap_storage, "_messages", lambda *given: (read.append(given), messages(*given))[1]
     )
     since = EPOCH + 250 * 10**7
-    assert next(bag.messages(since=since)).log_time == since
+    assert next(bag.read_messages(since=since)).log_time == since
     assert len(read) == 1
-    (last,) = bag.latest(["/rare"], since)
+    (last,) = bag.read_latest(["/rare"], since)
     assert last.log_time == EPOCH + 157 * 10**7
     assert len(read) <= 5  # those with rare messages
 
@@ -108,7 +108,7 @@ def test_a_damaged_chunk_before_a_time_does_not_matter(tmp_path):
     path.write_bytes(content)
     bag, damage = read_bag(path), []
     since = EPOCH + 250 * 10**7
-    assert len(list(bag.messages(damage=damage, since=since))) == 150
+    assert len(list(bag.read_messages(damage=damage, since=since))) == 150
     assert damage == []
-    assert len(list(bag.messages(damage=damage, since=0))) < 400
+    assert len(list(bag.read_messages(damage=damage, since=0))) < 400
     assert "is damaged in its chunk" in damage[0]

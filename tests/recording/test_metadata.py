@@ -20,7 +20,7 @@ def test_real_metadata_is_written_again(shared_data):
     folder = shared_data / "ros2-jazzy/bags/probe_path_mcap"
     real, bag = information_of(folder), read_bag(folder)
     order = [each["topic_metadata"]["name"] for each in real["topics_with_message_count"]]
-    topics = [bag.topic(name) for name in order]
+    topics = [bag.find_topic(name) for name in order]
     (file,) = real["relative_file_paths"]
     assert bag_information(file, topics, bag.start, bag.end - bag.start) == real
 
@@ -65,7 +65,7 @@ DEFAULT = qos_to_yaml([DEFAULT_QOS])
 
 def test_the_default_is_what_a_real_publisher_of_depth_10_was_recorded_with(shared_data):
     real = read_bag(shared_data / "ros2-jazzy/bags/probe_path_mcap")
-    assert real.topic("/tracker/pose").qos == (DEFAULT_QOS,)
+    assert real.find_topic("/tracker/pose").qos == (DEFAULT_QOS,)
     assert qos_from_yaml("") == qos_from_yaml("[]") == qos_from_yaml(None) == ()
 
 

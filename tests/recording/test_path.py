@@ -11,10 +11,10 @@ from session_files import EPOCH, HI
 from wrench_files import WrenchRecord, write_wrenches
 
 from us_sim.errors import BagError
-from us_sim.recording.path import POSE_STAMPED, ProbePath, bodies_in, read_path, write_path
-from us_sim.recording.press_and_slide import press_and_slide
+from us_sim.recording.path import POSE_STAMPED, ProbePath, list_bodies, read_path, write_path
+from us_sim.recording.press_and_slide import make_press_and_slide
 from us_sim.recording.reader import read_bag
-from us_sim.recording.schemas import jazzy_definitions
+from us_sim.recording.schemas import load_jazzy_definitions
 from us_sim.recording.writer import BagWriter
 from us_sim.run.session_tables import read_wrenches
 
@@ -80,7 +80,7 @@ def test_a_written_pose_is_what_rclpy_serializes(shared_data, tmp_path):
         np.array([[0.5, -0.5, 0.5, 0.5]]),
     )
     write_path(tmp_path / "path.mcap", path)
-    (message,) = read_bag(tmp_path).messages()
+    (message,) = read_bag(tmp_path).read_messages()
     sample = (shared_data / "ros2-jazzy/messages.json").read_text().split('"cdr_hex": "')[1]
     assert message.data.hex() == sample.split('"')[0]
 
@@ -109,7 +109,7 @@ def test_no_usable_pose_at_all(tmp_path):
 def test_which_topic(tmp_path):
     with BagWriter(tmp_path / "bag.mcap") as bag:
         bag.add_topic("/note", "std_msgs/msg/String")
-        bag.write("/note", HI, EPOCH)
+        bag.write_message("/note", HI, EPOCH)
         bag.flush()
         with pytest.raises(BagError, match=r"PoseStamped.* /note \(std_msgs"):
             read_path(tmp_path / "bag.mcap")
@@ -127,7 +127,7 @@ def test_which_topic(tmp_path):
 
 def message(type_name, **fields):
     """A message of rosbags."""
-    return jazzy_definitions().types[type_name](**fields)
+    return load_jazzy_definitions().types[type_name](**fields)
 
 
 def vector(kind, x):
@@ -187,7 +187,9 @@ def record(file, topics):
             kind = messages[0].__msgtype__
             bag.add_topic(topic, kind)
             for k, each in enumerate(messages):
-                bag.write(topic, jazzy_definitions().serialize_cdr(each, kind), EPOCH + k)
+                bag.write_message(
+                    topic, load_jazzy_definitions().serialize_cdr(each, kind), EPOCH + k
+                )
 
 
 TF = "tf2_msgs/msg/TFMessage"
@@ -250,7 +252,7 @@ def test_the_links_of_a_chain_are_taken_at_one_time(tmp_path):
 
 def test_tf_of_a_real_recorder_holds_the_path_of_its_poses(shared_data):
     bag = shared_data / "ros2-jazzy/bags/probe_path_mcap"
-    (body,) = bodies_in(read_bag(bag))[TF]
+    (body,) = list_bodies(read_bag(bag))[TF]
     moved, posed = read_path(bag, body), read_path(bag)
     among = np.isin(moved.stamps, posed.stamps)
     assert among.sum() > 250
@@ -265,7 +267,7 @@ def wrenches(frame="probe", topic="/probe/wrench"):
 
 
 def test_another_type_a_silent_topic_and_a_missing_one_are_refused(tmp_path):
-    path = press_and_slide(rate=5.0)
+    path = make_press_and_slide(rate=5.0)
     write_path(tmp_path / "path.mcap", path)
     with pytest.raises(BagError, match=POSE_STAMPED):
         read_wrenches(read_bag(tmp_path / "path.mcap"), path.topic)

@@ -40,7 +40,7 @@ def test_millimetres_become_metres_and_the_recorders_clock_stays(tmp_path):
     assert recording.times == [7.25]
     expected = np.array([[0, -1, 0, 0.01], [1, 0, 0, 0.02], [0, 0, 1, 0.03], [0, 0, 0, 1]])
     np.testing.assert_allclose(recording.transforms["ProbeToTracker"].matrices[0], expected)
-    path = recording.probe_path("Probe")
+    path = recording.make_probe_path("Probe")
     assert path.stamps == [7_250_000_000]
     assert (path.frame_id, path.rejected, path.note) == ("Tracker", 0, "")
 
@@ -57,7 +57,7 @@ def test_a_body_is_led_to_a_reference_by_way_of_the_tracker(tmp_path):
         ("ProbeToReference", reference.inverse() @ probe),
         ("TrackerToProbe", probe.inverse()),
     ):
-        found = recording.probe_path(name).pose(0).matrix
+        found = recording.make_probe_path(name).pose_at(0).matrix
         np.testing.assert_allclose(found, expected.matrix, atol=1e-12)
 
 
@@ -75,10 +75,10 @@ def test_a_body_is_led_to_a_reference_by_way_of_the_tracker(tmp_path):
 def test_what_is_no_pose_is_not_valid_and_counted(tmp_path, bad, reason):
     good = sample(ProbeToTracker=MOVED)
     recording = read_tracker_recording(write(tmp_path, [good, good | bad, good]))
-    assert recording.left_out("ProbeToTracker") == {reason: 1}
+    assert recording.count_left_out("ProbeToTracker") == {reason: 1}
     assert recording.transforms["ProbeToTracker"].valid.tolist() == [True, False, True]
     assert np.isnan(recording.transforms["ProbeToTracker"].matrices[1]).all()
-    path = recording.probe_path()
+    path = recording.make_probe_path()
     assert (len(path), path.rejected) == (2, 1)
     assert reason in path.note
 
@@ -87,8 +87,9 @@ def test_a_sample_without_a_time_is_left_out_whole(tmp_path):
     samples = [sample(ProbeToTracker=MOVED), sample("never", ProbeToTracker=MOVED)]
     recording = read_tracker_recording(write(tmp_path, samples))
     assert (len(recording), recording.untimed) == (1, 1)
-    assert recording.probe_path().note == "1 of the 2 poses of ProbeToTracker are left out " + (
-        "(1 without a time)"
+    assert (
+        recording.make_probe_path().note
+        == "1 of the 2 poses of ProbeToTracker are left out " + ("(1 without a time)")
     )
 
 
@@ -104,11 +105,11 @@ def test_names_that_lead_nowhere_say_which_there_are(tmp_path):
     path = write(tmp_path, [sample(ProbeToTracker=MOVED, StylusToTracker=MOVED)])
     recording = read_tracker_recording(path)
     for call in (
-        lambda: recording.probe_path(),
-        lambda: recording.probe_path("Needle"),
-        lambda: recording.probe_path("ProbeToPatient"),
-        lambda: recording.probe_path("Tracker"),
-        lambda: recording.probe_path("ProbeToProbe"),
+        lambda: recording.make_probe_path(),
+        lambda: recording.make_probe_path("Needle"),
+        lambda: recording.make_probe_path("ProbeToPatient"),
+        lambda: recording.make_probe_path("Tracker"),
+        lambda: recording.make_probe_path("ProbeToProbe"),
     ):
         with pytest.raises(TrackingError, match="ProbeToTracker, StylusToTracker"):
             call()
@@ -120,8 +121,8 @@ def test_bodies_whose_names_hold_to_are_read_as_plus_reads_them(tmp_path):
     recording = read_tracker_recording(path)
     assert sorted(recording.transforms) == sorted(names)
     for body, reference in (("Torso", "Tracker"), ("TestTool", "Tracker"), ("ToolTip", "Tool")):
-        assert recording.probe_path(body).frame_id == reference
-    tip = recording.probe_path("ToolTipToTracker").pose(0).matrix
+        assert recording.make_probe_path(body).frame_id == reference
+    tip = recording.make_probe_path("ToolTipToTracker").pose_at(0).matrix
     tool = recording.transforms["ToolToTracker"].matrices[0]
     np.testing.assert_allclose(tip, tool @ tool, atol=1e-12)
 
@@ -141,11 +142,11 @@ def test_a_recording_may_be_nrrd(tmp_path):
 def test_the_invalid_sample_and_the_outlier_of_a_real_recording_are_left_out(recordings):
     recording = read_tracker_recording(recordings / "TransformInterpolationTest.igs.mha")
     assert len(recording) == 500
-    assert {name: recording.left_out(name) for name in recording.transforms} == {
+    assert {name: recording.count_left_out(name) for name in recording.transforms} == {
         "ProbeToTracker": {"ProbeToTrackerTransformStatus is not OK": 1},
         "ReferenceToTracker": {"an identity among poses that are none": 1},
     }
-    path = recording.probe_path("ProbeToReference")
+    path = recording.make_probe_path("ProbeToReference")
     assert (len(path), path.rejected) == (499, 1)
     # Without them the probe only moves by millimetres against the reference.
     assert np.ptp(path.positions, axis=0).max() < 0.02

@@ -25,7 +25,9 @@ def write_session(path, compression="none", chunk_size=2000, count=200):
         for topic in ("/a", "/b"):
             bag.add_topic(topic, STRING)
         for k in range(count):
-            bag.write("/b" if k % 5 == 0 else "/a", HI + bytes([k]), EPOCH + k * 10**7, EPOCH + k)
+            bag.write_message(
+                "/b" if k % 5 == 0 else "/a", HI + bytes([k]), EPOCH + k * 10**7, EPOCH + k
+            )
     return path
 
 
@@ -46,14 +48,14 @@ def test_real_bags_as_rosbags_reads_them(shared_data, name):
         expected = [(c.topic, time, bytes(data)) for c, time, data in reader.messages()]
         assert (bag.start, bag.end + 1) == (reader.start_time, reader.end_time)
         for connection in reader.connections:
-            topic = bag.topic(connection.topic)
+            topic = bag.find_topic(connection.topic)
             assert topic.type_name == connection.msgtype
             assert topic.type_hash == connection.digest
             assert topic.message_count == connection.msgcount
             assert [q.depth for q in topic.qos] == [
                 q.depth for q in connection.ext.offered_qos_profiles
             ]
-    read = [(m.topic, m.log_time, m.data) for m in bag.messages()]
+    read = [(m.topic, m.log_time, m.data) for m in bag.read_messages()]
     assert read == expected
     assert len(read) == bag.message_count
     assert not bag.fault
@@ -67,12 +69,12 @@ def test_every_bag_of_rosbag2s_own_tests_is_read_or_refused_in_a_sentence(shared
     assert (len(folders), len(files)) == (10, 20)
     for path in sorted(folders | files):
         bag = read_bag(path)
-        read = [(m.topic, m.log_time, m.data) for m in bag.messages()]
+        read = [(m.topic, m.log_time, m.data) for m in bag.read_messages()]
         assert len(read) == bag.message_count > 0
         assert [time for _, time, _ in read] == sorted(time for _, time, _ in read)
         if "wrong_rmw" in str(path):
             with pytest.raises(BagError, match="wrong_format"):
-                bag.deserialize(next(bag.messages()))
+                bag.deserialize(next(bag.read_messages()))
             continue
         parts = [path] if path.is_file() else sorted(path.glob("*.mcap"))
         expected = [content for part in parts for content in contents_by_mcap(part)]
@@ -81,7 +83,7 @@ def test_every_bag_of_rosbag2s_own_tests_is_read_or_refused_in_a_sentence(shared
             with Reader(path) as reader:
                 by_rosbags = [(c.topic, time, bytes(data)) for c, time, data in reader.messages()]
             assert sorted(read) == sorted(by_rosbags)
-        for message in bag.messages():
+        for message in bag.read_messages():
             if message.type_name.endswith("_Event"):
                 with pytest.raises(BagError, match="_Event"):
                     bag.deserialize(message)
@@ -92,11 +94,11 @@ def test_every_bag_of_rosbag2s_own_tests_is_read_or_refused_in_a_sentence(shared
 def test_known_contents_of_rosbag2s_own_tests(shared_data):
     root = shared_data / "mcap-rosbag2"
     talker = read_bag(root / "rosbag2_py/test/resources/mcap/talker")
-    words = [talker.deserialize(message).data for message in talker.messages(["/topic"])]
+    words = [talker.deserialize(message).data for message in talker.read_messages(["/topic"])]
     assert words == [f"Hello, world! {k}" for k in range(10)]
     seek = read_bag(root / "rosbag2_transport/test/resources/mcap/test_bag_for_seek")
     assert [topic.type_name for topic in seek.topics] == ["test_msgs/msg/BasicTypes"]
-    assert [seek.deserialize(m).int32_value for m in seek.messages()] == [1, 2, 3, 4, 5]
+    assert [seek.deserialize(m).int32_value for m in seek.read_messages()] == [1, 2, 3, 4, 5]
     with pytest.raises(BagError, match=r"holds no bag"):
         read_bag(root / "ros2bag/test/resources/empty_bag")
     with pytest.raises(BagError, match=r"only_services.mcap, only_topics.mcap"):
@@ -124,8 +126,8 @@ def test_a_file_cut_anywhere_gives_what_was_before_the_cut(
             read_bag(file)
         return
     bag = read_bag(file)
-    read = list(bag.messages())
-    assert read == list(read_bag(sessions[compression]).messages())[: len(read)]
+    read = list(bag.read_messages())
+    assert read == list(read_bag(sessions[compression]).read_messages())[: len(read)]
     assert bag.message_count == len(read)
     assert bag.fault
     assert f"{len(read)} messages over" in bag.fault
@@ -148,7 +150,7 @@ def test_no_damage_leads_to_anything_but_a_sentence(tmp_path_factory, damageable
     file.write_bytes(content)
     refusal = ""
     try:
-        list(read_bag(file).messages())
+        list(read_bag(file).read_messages())
     except BagError as error:
         refusal = str(error)
     assert not refusal or refusal.startswith(str(file))
@@ -156,25 +158,25 @@ def test_no_damage_leads_to_anything_but_a_sentence(tmp_path_factory, damageable
 
 def test_messages_compressed_one_by_one(tmp_path):
     write_session(tmp_path / "plain.mcap")
-    plain = list(read_bag(tmp_path / "plain.mcap").messages())
+    plain = list(read_bag(tmp_path / "plain.mcap").read_messages())
     with BagWriter(tmp_path / "packed") as packed:
         for topic in ("/a", "/b"):
             packed.add_topic(topic, STRING)
         for message in plain:
             data = zstandard.compress(message.data)
-            packed.write(message.topic, data, message.log_time, message.publish_time)
-    assert list(read_bag(tmp_path / "packed").messages()) == plain
+            packed.write_message(message.topic, data, message.log_time, message.publish_time)
+    assert list(read_bag(tmp_path / "packed").read_messages()) == plain
 
 
 def test_messages_recorded_while_simulated_time_stood_are_read_one_by_one(tmp_path):
     with BagWriter(tmp_path / "a.mcap", sidecar=False) as writer:
         writer.add_topic("/note", STRING)
         for number in range(120):
-            writer.write("/note", bytes(200_000), 10**18, sequence=number)
+            writer.write_message("/note", bytes(200_000), 10**18, sequence=number)
     bag = read_bag(tmp_path / "a.mcap")
     tracemalloc.start()
     try:
-        assert [message.sequence for message in bag.messages()] == list(range(120))
+        assert [message.sequence for message in bag.read_messages()] == list(range(120))
         assert tracemalloc.get_traced_memory()[1] < 12 << 20
     finally:
         tracemalloc.stop()
@@ -183,14 +185,14 @@ def test_messages_recorded_while_simulated_time_stood_are_read_one_by_one(tmp_pa
 def test_what_does_not_fit_its_type(tmp_path):
     with BagWriter(tmp_path / "bag.mcap") as writer:
         writer.add_topic("/note", STRING)
-        writer.write("/note", b"\0\1\0\0\xff\xff\0\0hi\0", EPOCH)
-        writer.write("/note", b"", EPOCH + 1)
+        writer.write_message("/note", b"\0\1\0\0\xff\xff\0\0hi\0", EPOCH)
+        writer.write_message("/note", b"", EPOCH + 1)
     bag = read_bag(tmp_path)
-    for message in bag.messages():
+    for message in bag.read_messages():
         with pytest.raises(BagError, match=f"{message.log_time} ns .*{STRING}"):
             bag.deserialize(message)
     with pytest.raises(BagError, match=r"/other; .* /note"):
-        next(bag.messages(["/other"]))
+        next(bag.read_messages(["/other"]))
 
 
 def test_a_topic_of_two_types_is_refused(tmp_path):
@@ -207,18 +209,18 @@ def test_quality_of_service_that_one_file_of_a_bag_lacks_is_that_of_the_other(tm
     for k in range(2):
         with BagWriter(tmp_path / f"bag_{k}.mcap", sidecar=False) as bag:
             bag.add_topic("/note", STRING, quality if k == offered else ())
-            bag.write("/note", HI, EPOCH + k)
-    assert read_bag(tmp_path).topic("/note").qos == quality
+            bag.write_message("/note", HI, EPOCH + k)
+    assert read_bag(tmp_path).find_topic("/note").qos == quality
 
 
 def test_messages_of_the_same_time_come_in_the_order_of_the_file(tmp_path):
     with BagWriter(tmp_path / "session.mcap") as bag:
         bag.add_topic("/note", STRING)
         for time, last in ((7, 1), (5, 2), (7, 3)):
-            bag.write("/note", HI + bytes([last]), EPOCH + time)
+            bag.write_message("/note", HI + bytes([last]), EPOCH + time)
             if last == 1:
                 bag.flush()  # what follows is in a chunk of its own, which begins earlier
-    read = [(m.log_time - EPOCH, m.data[-1]) for m in read_bag(tmp_path).messages()]
+    read = [(m.log_time - EPOCH, m.data[-1]) for m in read_bag(tmp_path).read_messages()]
     assert read == [(5, 2), (7, 1), (7, 3)]
 
 
@@ -229,7 +231,7 @@ def test_files_of_a_split_bag_are_read_in_their_order_without_metadata(shared_da
     for old, new in [(0, 9), (1, 10), (2, 11)]:
         part = folder / f"multiple_files/multiple_files_{old}.mcap"
         shutil.copy(part, tmp_path / f"b_{new}.mcap")
-    assert list(read_bag(tmp_path).messages()) == list(split.messages())
+    assert list(read_bag(tmp_path).read_messages()) == list(split.read_messages())
 
 
 def test_blocks_of_zeros_after_a_power_cut(tmp_path, sessions):
@@ -237,10 +239,10 @@ def test_blocks_of_zeros_after_a_power_cut(tmp_path, sessions):
     file = tmp_path / "session.mcap"
     file.write_bytes(content[: len(content) // 3] + bytes(5000))
     bag = read_bag(file)
-    read = list(bag.messages())
+    read = list(bag.read_messages())
     assert bag.fault
     assert 10 < len(read) < 100
-    assert read == list(read_bag(sessions["none"]).messages())[: len(read)]
+    assert read == list(read_bag(sessions["none"]).read_messages())[: len(read)]
 
 
 def test_an_old_database_and_its_journal(tmp_path):
@@ -263,7 +265,7 @@ def test_an_old_database_and_its_journal(tmp_path):
     with pytest.raises(BagError, match="wal_checkpoint"):
         read_bag(tmp_path / "killed.db3")
     bag = read_bag(live)
-    thing, note, *others = bag.messages()
+    thing, note, *others = bag.read_messages()
     assert 2 + len(others) == bag.message_count == 573
     assert bag.deserialize(note).data == "hi"
     with pytest.raises(BagError, match="my_msgs/msg/Thing"):
@@ -291,7 +293,7 @@ def test_files_that_are_no_bags(shared_data, tmp_path, name, content, word):
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(BagError, match=word) as caught:
-        list(read_bag(path).messages())
+        list(read_bag(path).read_messages())
     assert str(path) in str(caught.value)
 
 

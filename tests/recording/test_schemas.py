@@ -7,7 +7,12 @@ import pytest
 from mcap.reader import make_reader
 
 from us_sim.errors import BagError
-from us_sim.recording.schemas import definitions, normalized_type, schema_text, type_hash
+from us_sim.recording.schemas import (
+    compute_type_hash,
+    make_schema,
+    normalize_type,
+    parse_definitions,
+)
 
 RULE = "=" * 80
 
@@ -33,7 +38,7 @@ def _no_ros(monkeypatch):
 def parts(text, type_name):
     """Text of each message in a schema, by its full name, in order."""
     first, *others = re.split(rf"\n{RULE}\nMSG: (\S+)\n", text)
-    names = [type_name, *map(normalized_type, others[::2])]
+    names = [type_name, *map(normalize_type, others[::2])]
     return dict(zip(names, [first, *others[1::2]], strict=True))
 
 
@@ -59,7 +64,7 @@ def test_without_ros_the_definitions_are_those_of_the_real_recorder(real_bag):
     texts, _ = real_bag
     assert len(texts) == 6
     for type_name, text in texts.items():
-        real, ours = parts(text, type_name), parts(schema_text(type_name), type_name)
+        real, ours = parts(text, type_name), parts(make_schema(type_name), type_name)
         assert {*ours} == {*real}
         for name, definition in real.items():
             package = name.split("/")[0]
@@ -69,7 +74,7 @@ def test_without_ros_the_definitions_are_those_of_the_real_recorder(real_bag):
 @pytest.mark.usefixtures("_no_ros")
 def test_hashes_are_those_of_the_real_recorder(real_bag):
     _, hashes = real_bag
-    assert {name: type_hash(name) for name in hashes} == hashes
+    assert {name: compute_type_hash(name) for name in hashes} == hashes
 
 
 def test_an_overlay_hides_what_it_overrides(tmp_path, monkeypatch):
@@ -79,13 +84,13 @@ def test_an_overlay_hides_what_it_overrides(tmp_path, monkeypatch):
         (folder / "Thing.msg").write_text(text)
         (folder / "Other.msg").write_text("# note\nstring<=5 name\nint32 MAX=5\n")
     monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path}/over:{tmp_path}/under")
-    thing, other = parts(schema_text("my_msgs/msg/Thing"), "my_msgs/msg/Thing").values()
+    thing, other = parts(make_schema("my_msgs/msg/Thing"), "my_msgs/msg/Thing").values()
     assert fields(thing, "my_msgs") == [
         ("int32", "new", ""),
         ("my_msgs/Other[<=3]", "others", ""),
     ]
     assert fields(other, "my_msgs") == [("string<=5", "name", ""), ("int32", "MAX", "5")]
-    assert type_hash("my_msgs/msg/Thing").startswith("RIHS01_")
+    assert compute_type_hash("my_msgs/msg/Thing").startswith("RIHS01_")
 
 
 @pytest.mark.usefixtures("_no_ros")
@@ -94,7 +99,7 @@ def test_every_message_of_the_graph_can_be_written(shared_data):
     for sample in samples:
         if "/msg/" not in (type_name := sample["type"]):
             continue
-        store = definitions(type_name, schema_text(type_name))
+        store = parse_definitions(type_name, make_schema(type_name))
         message = store.deserialize_cdr(bytes.fromhex(sample["cdr_hex"]), type_name)
         again = store.serialize_cdr(message, type_name, little_endian=True)
         assert bytes(again).hex().startswith(sample["cdr_hex"].rstrip("0"))
@@ -114,10 +119,10 @@ def test_every_message_of_the_graph_can_be_written(shared_data):
 )
 def test_unknown_types(name, message):
     with pytest.raises(BagError, match=message):
-        schema_text(name)
+        make_schema(name)
 
 
 @pytest.mark.parametrize("text", ["int32", "wibble wobble wubble"])
 def test_text_that_defines_nothing(text):
     with pytest.raises(BagError, match="definition of my_msgs/msg/Thing cannot be understood"):
-        definitions("my_msgs/msg/Thing", text)
+        parse_definitions("my_msgs/msg/Thing", text)

@@ -55,9 +55,9 @@ def test_a_real_bag_written_again_is_the_same_bag(shared_data, tmp_path, name):
     document = yaml.safe_load((folder / "metadata.yaml").read_text())
     listed = document["rosbag2_bagfile_information"]["topics_with_message_count"]
     with BagWriter(tmp_path / name) as ours:
-        for entry in (real.topic(each["topic_metadata"]["name"]) for each in listed):
+        for entry in (real.find_topic(each["topic_metadata"]["name"]) for each in listed):
             ours.add_topic(entry.name, entry.type_name, entry.qos, schema=entry.schema)
-        write_all(ours, real.messages())
+        write_all(ours, real.read_messages())
     file = tmp_path / name / f"{name}_0.mcap"
     real_header, *expected = mcap_content(folder / file.name)
     header, *written = mcap_content(file)
@@ -67,7 +67,7 @@ def test_a_real_bag_written_again_is_the_same_bag(shared_data, tmp_path, name):
         yaml.safe_load((each / "metadata.yaml").read_text()) for each in (file.parent, folder)
     ]
     assert sidecars[0] == sidecars[1]
-    assert list(read_bag(file).messages()) == list(real.messages())
+    assert list(read_bag(file).read_messages()) == list(real.read_messages())
 
 
 @pytest.mark.parametrize("compression", ["none", "zstd"])
@@ -80,7 +80,7 @@ def test_rosbags_and_mcap_read_what_was_written(tmp_path, compression):
         bag.add_topic("/silent", "geometry_msgs/msg/PoseStamped")
         for k in range(300):
             topic = "/a" if k % 3 else "/b"
-            bag.write(topic, text(f"{k}"), EPOCH + k * 10**8, EPOCH + k)
+            bag.write_message(topic, text(f"{k}"), EPOCH + k * 10**8, EPOCH + k)
     with AnyReader([tmp_path]) as reader:
         assert reader.message_count == 300
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
@@ -104,11 +104,11 @@ def test_rosbags_and_mcap_read_what_was_written(tmp_path, compression):
 def test_flush_makes_everything_readable_before_the_bag_is_closed(tmp_path):
     bag = BagWriter(tmp_path / "session.mcap")
     bag.add_topic("/note", STRING)
-    bag.write("/note", HI, EPOCH)
+    bag.write_message("/note", HI, EPOCH)
     assert read_bag(tmp_path / "session.mcap").message_count == 0
     bag.flush()
     half = read_bag(tmp_path / "session.mcap")
-    assert [half.deserialize(message).data for message in half.messages()] == ["hi"]
+    assert [half.deserialize(message).data for message in half.read_messages()] == ["hi"]
     bag.close()
     assert not read_bag(tmp_path).fault
 
@@ -118,7 +118,7 @@ def test_metadata_that_cannot_be_written_is_said(tmp_path, name):
     folder = tmp_path / "bag"
     bag = BagWriter(tmp_path / "bag" / name if name.endswith(".mcap") else folder)
     bag.add_topic("/note", STRING)
-    bag.write("/note", HI, EPOCH)
+    bag.write_message("/note", HI, EPOCH)
     (folder / "metadata.yaml").mkdir()
     with pytest.raises(BagError, match=f"`ros2 bag reindex {folder}`"):
         bag.close()
@@ -203,7 +203,7 @@ def test_an_empty_bag_is_a_bag(tmp_path):
         bag.add_topic("/note", STRING)
     read = read_bag(tmp_path / "quiet")
     assert not read.fault
-    assert (read.start, read.end, list(read.messages())) == (None, None, [])
+    assert (read.start, read.end, list(read.read_messages())) == (None, None, [])
     assert [topic.name for topic in read.topics] == ["/note"]
     with AnyReader([tmp_path / "quiet"]) as reader:
         assert reader.message_count == 0

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from us_sim.errors import BagError
-from us_sim.recording.press_and_slide import press_and_slide
+from us_sim.recording.press_and_slide import make_press_and_slide
 from us_sim.run.contact_sheet import pick_moments
 
 
@@ -22,14 +22,14 @@ def told(path):
 
 
 def test_the_scripted_press():
-    moments = told(press_and_slide())
+    moments = told(make_press_and_slide())
     assert moments["first touch"] == pytest.approx(1.5, abs=0.02)
     assert moments["full press"] == pytest.approx(3.2, abs=0.3)
     assert moments["last touch"] == pytest.approx(8.7, abs=0.02)
 
 
 def test_a_path_that_never_touches_has_its_moments_too():
-    path = press_and_slide(depth=0.0)
+    path = make_press_and_slide(depth=0.0)
     assert len(told(path)) == 3
 
 

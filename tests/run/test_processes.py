@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from us_sim.errors import UsSimError
-from us_sim.run.domain import alone_on_domain
+from us_sim.run.domain import lock_domain
 from us_sim.run.plan import NodeProcess
 from us_sim.run.processes import RunningNode, end_nodes
 from us_sim.run.shared_memory import remove_abandoned_segments
@@ -100,12 +100,12 @@ def _own_domain(monkeypatch):
 
 
 def test_the_second_is_refused_until_the_first_has_ended():
-    with alone_on_domain():
+    with lock_domain():
         with pytest.raises(UsSimError, match=r"runs already on ROS domain test-.*set ROS_DOM"):
-            alone_on_domain().__enter__()
-        with alone_on_domain("/left"):  # another namespace
+            lock_domain().__enter__()
+        with lock_domain("/left"):  # another namespace
             pass
-    with alone_on_domain():
+    with lock_domain():
         pass
 
 
@@ -116,7 +116,7 @@ def test_a_killed_one_leaves_the_domain_free():
     with subprocess.Popen([sys.executable, "-c", program], stdin=pipe, stdout=pipe) as first:
         first.stdout.readline()
         with pytest.raises(UsSimError, match="runs already"):
-            alone_on_domain().__enter__()
+            lock_domain().__enter__()
         first.kill()
-    with alone_on_domain():
+    with lock_domain():
         pass

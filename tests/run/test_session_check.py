@@ -9,17 +9,17 @@ from session_files import EPOCH, PERIOD, TYPES, press, write
 
 from us_sim.command.main import main
 from us_sim.recording.reader import read_bag
-from us_sim.recording.schemas import stamped
-from us_sim.recording.stamps import stamp_reader
+from us_sim.recording.schemas import serialize_stamped
+from us_sim.recording.stamps import make_stamp_reader
 from us_sim.recording.topic import DEFAULT_QOS
 from us_sim.recording.writer import BagWriter
-from us_sim.run.session_check import check
+from us_sim.run.session_check import check_bag
 
 IMAGE = "/ultrasound/image"
 
 
 def findings(file):
-    found = check(read_bag(file))
+    found = check_bag(read_bag(file))
     return found, [(each.kind, each.text) for each in found.findings]
 
 
@@ -58,9 +58,9 @@ def test_the_bags_of_rosbag2s_own_tests_pass(shared_data):
 def test_stamps_are_those_that_rosbags_decodes(shared_data):
     bag = read_bag(shared_data / "ros2-jazzy/bags/probe_path_mcap")
     seen = set()
-    for message in bag.messages():
-        topic = bag.topic(message.topic)
-        reader = stamp_reader(bag, topic)
+    for message in bag.read_messages():
+        topic = bag.find_topic(message.topic)
+        reader = make_stamp_reader(bag, topic)
         decoded = bag.deserialize(message)
         header = getattr(decoded, "header", None) or (
             decoded.transforms[0].header if topic.name == "/tf" else None
@@ -75,7 +75,7 @@ def test_stamps_are_those_that_rosbags_decodes(shared_data):
 
 def test_a_big_endian_stamp_is_read(tmp_path):
     bag = read_bag(write(tmp_path / "s.mcap", press(1)))
-    reader = stamp_reader(bag, bag.topic("/probe/pose"))
+    reader = make_stamp_reader(bag, bag.find_topic("/probe/pose"))
     assert reader(b"\0\0\0\0" + struct.pack(">iI", 7, 5)) == 7 * 10**9 + 5
 
 
@@ -171,7 +171,7 @@ def number_anew(messages):
 def test_what_is_only_unusual_is_whole(tmp_path, change, latency, missing):
     messages = press()
     change(messages)
-    found = check(read_bag(write(tmp_path / "s.mcap", messages)))
+    found = check_bag(read_bag(write(tmp_path / "s.mcap", messages)))
     assert not found.findings
     assert found.rows[1][2:5] == ("60.0", "0.02", latency)
     assert {each.missing for each in found.topics} == {missing}
@@ -217,8 +217,8 @@ def test_what_several_publish_may_come_in_another_order(tmp_path, stamps, logged
         bag.add_topic("/diagnostics", kind)
         for number, (stamp, seconds) in enumerate(zip(stamps, logged, strict=True), 1):
             came = EPOCH + round(1e9 * seconds)
-            report = stamped(kind, EPOCH + round(1e9 * stamp), "", status=[])
-            bag.write("/diagnostics", bytes(report), came, came, number)
+            report = serialize_stamped(kind, EPOCH + round(1e9 * stamp), "", status=[])
+            bag.write_message("/diagnostics", bytes(report), came, came, number)
     assert bool(findings(tmp_path / "several.mcap")[1]) == is_told
 
 
@@ -227,7 +227,7 @@ def test_a_folder_that_lacks_a_file_of_its_metadata(tmp_path):
         for topic, kind in TYPES.items():
             bag.add_topic(topic, kind)
         for topic, data, *times, number in press():
-            bag.write(topic, data, *times, number)
+            bag.write_message(topic, data, *times, number)
     yaml = tmp_path / "bag" / "metadata.yaml"
     yaml.write_text(yaml.read_text().replace("- bag_0.mcap\n", "- bag_0.mcap\n  - bag_1.mcap\n"))
     ((kind, text),) = findings(tmp_path / "bag")[1]
@@ -241,6 +241,6 @@ def test_latched_messages_have_no_age_and_no_rate(tmp_path):
         for topic, kind in TYPES.items():
             bag.add_topic(topic, kind, [latched])
         for topic, data, *times, number in press()[::40]:
-            bag.write(topic, data, *(time + 10**10 for time in times), number)
-    found = check(read_bag(tmp_path / "s.mcap"))
+            bag.write_message(topic, data, *(time + 10**10 for time in times), number)
+    found = check_bag(read_bag(tmp_path / "s.mcap"))
     assert {row[4] for row in found.rows[1:]} == {"-"}

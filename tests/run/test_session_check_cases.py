@@ -5,11 +5,11 @@ import shutil
 import pytest
 
 from us_sim.recording.reader import read_bag
-from us_sim.run.session_check import check
+from us_sim.run.session_check import check_bag
 
 
 def found(path):
-    return [finding.text for finding in check(read_bag(path)).findings]
+    return [finding.text for finding in check_bag(read_bag(path)).findings]
 
 
 def test_a_wrong_time_is_one_finding(shared_file):
@@ -24,7 +24,7 @@ def test_log_times_that_go_back_are_said_with_their_place(shared_file):
 
 @pytest.mark.slow
 def test_a_bag_of_every_type_is_read_to_the_end(shared_file):
-    checked = check(
+    checked = check_bag(
         read_bag(shared_file("cases/bag-every-type/test_bag_mcap/metadata.yaml").parent)
     )
     assert len(checked.topics) == 94
@@ -43,7 +43,7 @@ def test_all_stamps_zero_is_said_of_each_topic(shared_file):
 
 def test_packed_messages_are_read_unpacked(shared_file):
     bag = read_bag(shared_file("cases/bag-packed-messages/soccer_goal_12.mcap"))
-    images = [bag.deserialize(message) for message in bag.messages()]
+    images = [bag.deserialize(message) for message in bag.read_messages()]
     assert len(images) == 2
     assert {(image.height, image.width) for image in images} == {(480, 640)}
 
@@ -53,12 +53,12 @@ def test_of_thirteen_parts_the_one_that_is_there_is_read(shared_file, tmp_path):
     shutil.copy(folder / "soccer_goal_12.mcap", tmp_path)
     shutil.copy(folder / "metadata_of_13_parts.yaml", tmp_path / "metadata.yaml")
     bag = read_bag(tmp_path)
-    assert len(list(bag.messages())) == 2
+    assert len(list(bag.read_messages())) == 2
     assert all(f"soccer_goal_{part}.mcap" in bag.fault for part in range(12))
 
 
 def test_parts_whose_names_begin_with_their_number_are_one_recording(shared_file):
     folder = shared_file("cases/bag-parts-of-lyrical/0_session_2026_06_24-10_00_00.mcap").parent
-    times = [message.log_time for message in read_bag(folder).messages()]
+    times = [message.log_time for message in read_bag(folder).read_messages()]
     assert len(times) == 600
     assert times == sorted(times)

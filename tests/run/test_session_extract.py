@@ -11,7 +11,7 @@ from session_files import EPOCH, PERIOD, TYPES, image, press, write
 
 from us_sim.command.main import main
 from us_sim.recording.reader import read_bag
-from us_sim.recording.schemas import jazzy_definitions
+from us_sim.recording.schemas import load_jazzy_definitions
 from us_sim.recording.writer import BagWriter
 
 SPACING = (0.4e-3, 0.25e-3)  # m, of columns and of rows
@@ -24,7 +24,7 @@ def extracted(bag, out, *options):
 @pytest.fixture
 def scaled(tmp_path):
     """A session of images whose scale is known: 40 of them, the last 20 at half the rate."""
-    store = jazzy_definitions()
+    store = load_jazzy_definitions()
     to_probe = np.zeros((4, 4))
     to_probe[0, 0], to_probe[2, 1], to_probe[3, 3] = *SPACING, 1.0
     layout = store.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
@@ -33,10 +33,12 @@ def scaled(tmp_path):
     with BagWriter(tmp_path / "s.mcap", sidecar=False) as bag:
         bag.add_topic("/ultrasound/image", TYPES["/ultrasound/image"])
         bag.add_topic("/ultrasound/image_to_probe", "std_msgs/msg/Float64MultiArray")
-        bag.write("/ultrasound/image_to_probe", matrix, EPOCH)
+        bag.write_message("/ultrasound/image_to_probe", matrix, EPOCH)
         for k in range(40):
             stamp = EPOCH + (k + max(k - 20, 0)) * PERIOD
-            bag.write("/ultrasound/image", image(stamp, np.full((48, 64), 6 * k)), stamp + 1)
+            bag.write_message(
+                "/ultrasound/image", image(stamp, np.full((48, 64), 6 * k)), stamp + 1
+            )
     return tmp_path / "s.mcap"
 
 

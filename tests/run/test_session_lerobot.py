@@ -12,7 +12,7 @@ from session_files import EPOCH, PERIOD, TYPES, image, pose, press, wrench
 from us_sim.command.main import main
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
-from us_sim.recording.schemas import stamped
+from us_sim.recording.schemas import serialize_stamped
 from us_sim.recording.writer import BagWriter
 from us_sim.run.session_lerobot import Episode, Track
 
@@ -26,7 +26,7 @@ def write(file, messages, types):
         for topic, type_name in types.items():
             writer.add_topic(topic, type_name)
         for topic, data, log_time in messages:
-            writer.write(topic, data, log_time)
+            writer.write_message(topic, data, log_time)
     return file
 
 
@@ -37,7 +37,7 @@ def session(tmp_path):
 
 
 def joints(stamp, **positions):
-    return stamped(
+    return serialize_stamped(
         JOINTS,
         stamp,
         "base",
@@ -50,14 +50,14 @@ def joints(stamp, **positions):
 
 def compressed(stamp, pixels):
     data = cv2.imencode(".png", pixels)[1].ravel()
-    return stamped(COMPRESSED, stamp, "camera", format="png", data=data)
+    return serialize_stamped(COMPRESSED, stamp, "camera", format="png", data=data)
 
 
 def frames_of(file, rate=None, **wanted):
     episode = Episode(read_bag(file), **wanted)
-    moments = episode.moments(rate or episode.usual_rate)
-    frames = list(episode.frames(moments))
-    return moments, frames, episode.names, list(episode.told(moments))
+    moments = episode.choose_moments(rate or episode.usual_rate)
+    frames = list(episode.make_frames(moments))
+    return moments, frames, episode.names, list(episode.describe_use(moments))
 
 
 def test_a_session_gives_what_it_was_made_of_at_a_third_of_its_rate(session):
@@ -79,7 +79,7 @@ def test_a_constant_turn_is_met_whatever_the_signs_of_quaternions():
     turn = Rotation.from_rotvec(np.outer(np.arange(40) / 10, [0.5, 1.0, -2.0])).as_quat()
     poses = np.hstack([np.zeros((20, 3)), turn[::2] * np.resize([-1, 1, 1], 20)[:, None]])
     table = pd.DataFrame(poses, index=EPOCH + 2 * PERIOD * np.arange(20))
-    made = Track("/p", table, [], turns=True).values(EPOCH + PERIOD * np.arange(39))[:, 3:]
+    made = Track("/p", table, [], turns=True).interpolate(EPOCH + PERIOD * np.arange(39))[:, 3:]
     assert np.abs(np.einsum("ij,ij->i", made, turn[:39])) == pytest.approx(1.0, abs=1e-6)
     assert made[0, 3] >= 0
     assert (np.einsum("ij,ij->i", made[1:], made[:-1]) >= 0).all()

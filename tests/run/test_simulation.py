@@ -9,8 +9,8 @@ import pytest
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes.settings import SessionControlSettings
 from us_sim.recording.writer import BagWriter
-from us_sim.run.plan import Request, plan_of
-from us_sim.run.simulation import Simulation, bags_in_reach
+from us_sim.run.plan import RunRequest, make_plan
+from us_sim.run.simulation import Simulation, list_bags
 from us_sim.scene.reading import load_scene
 from us_sim.share import shared_path
 
@@ -26,7 +26,7 @@ class Supervisor:
         self.monitor = SimpleNamespace(reports={})
         self.plans = [plan]
 
-    def change(self, plan, anew=()):
+    def change_plan(self, plan, anew=()):
         assert set(anew) <= set(self.plan.nodes)
         self.plan = plan
         self.plans.append(plan)
@@ -64,9 +64,9 @@ class Control:
 
 @pytest.fixture
 def running(small_scene):
-    request = Request(load_scene(small_scene), by_hand=True)
+    request = RunRequest(load_scene(small_scene), by_hand=True)
     control = Control()
-    supervisor = Supervisor(plan_of(request), control)
+    supervisor = Supervisor(make_plan(request), control)
     simulation = Simulation(request, supervisor)
     simulation.update()
     return simulation, supervisor, control
@@ -173,13 +173,13 @@ def test_a_scene_that_is_loaded_says_that_there_are_no_images_meanwhile(running,
 
 def test_a_scene_s_own_recording_is_played_to_its_tracker_and_held_at_its_end():
     scene = load_scene("upper_arm_path")
-    plan = plan_of(Request(scene))
+    plan = make_plan(RunRequest(scene))
     played = plan.processes[-1].parameters
     assert (plan.nodes[-1], played["path"], played["stay"]) == ("path_player", PATH, True)
-    assert plan_of(Request(scene, by_hand=True)).nodes == plan.nodes[:-1]
+    assert make_plan(RunRequest(scene, by_hand=True)).nodes == plan.nodes[:-1]
     without = replace(scene, tracker=replace(scene.tracker, file=None))
     with pytest.raises(UsSimError, match="tracker"):
-        plan_of(Request(without))
+        make_plan(RunRequest(without))
 
 
 def test_all_scenes_are_listed_once_that_which_runs_first(running, small_scene):
@@ -203,7 +203,7 @@ def test_every_recording_of_a_folder_is_offered_once_the_newest_first(
     BagWriter(tmp_path / "work" / "split" / "a.mcap").close()
     for age, name in enumerate(["work/split", f"{recordings}/t1.mcap", f"{recordings}/t2.mcap"]):
         os.utime(tmp_path / name, (age, age))
-    offered = bags_in_reach(str(folder))
+    offered = list_bags(str(folder))
     own = [name for name, file in offered.items() if str(tmp_path) in file]
     assert [name for name in own if name != "rec"] == ["rec/t2.mcap", "rec/t1.mcap", "split"]
     assert len(offered) == len({*offered.values()})

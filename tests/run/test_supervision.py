@@ -10,15 +10,15 @@ import pytest
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes import INTERRUPTED
 from us_sim.recording.writer import BagWriter
-from us_sim.run.plan import NodeProcess, Plan, Request, plan_of
+from us_sim.run.plan import NodeProcess, Plan, RunRequest, make_plan
 from us_sim.run.supervision import (
     RESTART_S,
     START_S,
     Outcome,
     SupervisionSettings,
     Supervisor,
-    going_on,
-    images_in,
+    continue_process,
+    count_images,
 )
 from us_sim.scene.reading import load_scene
 from us_sim.share import find_bag
@@ -92,7 +92,7 @@ def killed(monkeypatch):
 def supervised(plan, **settings):
     """Return a supervisor that runs the plan, its processes by node, and its monitor."""
     supervisor = Supervisor(SupervisionSettings(**settings))
-    supervisor.start(plan)
+    supervisor.start_plan(plan)
     return supervisor, supervisor._running, supervisor.monitor
 
 
@@ -131,7 +131,7 @@ def test_images_that_were_not_to_be_recorded_are_not_lost(tmp_path, settings, lo
     plan = Plan([recorder, NodeProcess("slice_interpolator")])
     supervisor, _, monitor = supervised(plan)
     monitor.recordings[file] = 1
-    assert bool(supervisor.outcome().sentence()) is lost
+    assert bool(supervisor.make_outcome().describe_losses()) is lost
 
 
 def test_a_path_that_was_never_played_is_a_loss(session):
@@ -287,12 +287,12 @@ def test_another_plan_ends_what_it_lacks_and_then_starts_what_is_new(session):
 def test_a_player_waits_for_the_recorder_to_record_what_it_is_to_record(tmp_path, given, awaited):
     parameters = {"session_recorder": given}
     path = find_bag("press_and_slide.mcap")
-    request = Request(load_scene("upper_arm"), parameters, tmp_path / "a.mcap", path)
+    request = RunRequest(load_scene("upper_arm"), parameters, tmp_path / "a.mcap", path)
     for asked, expected in (
         (request, awaited),
         (replace(request, record=None, parameters={}), set()),
     ):
-        player = plan_of(asked).processes[-1]
+        player = make_plan(asked).processes[-1]
         assert player.node == "path_player"
         assert set(player.parameters["await_recorded"]) - {""} == expected
 
@@ -355,28 +355,28 @@ def test_supervision_that_cannot_be_is_refused(wrong):
 
 def test_a_player_goes_on_where_its_path_would_be():
     player = NodeProcess("path_player", {"path": "a.mcap"})
-    again = going_on(player, {"played": "120", "begun": "1700000000.250000000"})
+    again = continue_process(player, {"played": "120", "begun": "1700000000.250000000"})
     assert again.parameters == {"path": "a.mcap", "begun": 1700000000.25}
-    assert going_on(player, {"state": "waiting"}) is player
-    assert going_on(player, {"begun": "soon"}) is player
+    assert continue_process(player, {"state": "waiting"}) is player
+    assert continue_process(player, {"begun": "soon"}) is player
 
 
 def test_a_viewer_goes_on_where_pages_look_for_it():
     viewer = NodeProcess("viewer", {"host": "127.0.0.1", "port": 0})
-    assert going_on(viewer, {"port": "41234"}).parameters["port"] == 41234
-    assert going_on(viewer, {"port": "any"}).parameters["port"] == 0
+    assert continue_process(viewer, {"port": "41234"}).parameters["port"] == 41234
+    assert continue_process(viewer, {"port": "any"}).parameters["port"] == 0
 
 
 def test_others_start_as_they_did():
     tissue = NodeProcess("tissue_deformer", {"scene": "upper_arm", "solver": "msds"})
-    assert going_on(tissue, {"state": "ready"}) is tissue
+    assert continue_process(tissue, {"state": "ready"}) is tissue
 
 
 def test_a_sentence_tells_few_losses_one_by_one():
     losses = [f"loss {number}" for number in range(6)]
-    assert Outcome(1.0, [], []).sentence() == ""
-    assert Outcome(1.0, [Path("a.mcap")], []).sentence() == ""
-    told = Outcome(1.0, [Path("/tmp/a.mcap")], losses).sentence()
+    assert Outcome(1.0, [], []).describe_losses() == ""
+    assert Outcome(1.0, [Path("a.mcap")], []).describe_losses() == ""
+    told = Outcome(1.0, [Path("/tmp/a.mcap")], losses).describe_losses()
     assert told.startswith("loss 0; loss 1; loss 2; loss 3; and 2 more")
     assert told.endswith("a.mcap")
 
@@ -387,7 +387,7 @@ def test_images_are_counted_in_all_files_and_a_broken_one_has_none(tmp_path):
         with BagWriter(file, sidecar=False) as writer:
             writer.add_topic("/ultrasound/image", "std_msgs/msg/Empty")
             for stamp in range(count):
-                writer.write("/ultrasound/image", bytes(5), stamp)
+                writer.write_message("/ultrasound/image", bytes(5), stamp)
     empty = tmp_path / "empty.mcap"
     empty.touch()
-    assert images_in([*files, empty], "/ultrasound/image") == 3 + 4
+    assert count_images([*files, empty], "/ultrasound/image") == 3 + 4

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from us_sim.geometry.pose import Pose
-from us_sim.scene.building import tissue_model_of, volume_of
+from us_sim.scene.building import build_tissue_model, load_volume
 from us_sim.scene.reading import load_scene
 from us_sim.tissue.elasticity.materials import label_fractions
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
@@ -14,8 +14,8 @@ from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
 def arm():
     """The model, and volumes of vein and artery under the probe's middle, by tetrahedron."""
     scene = load_scene("upper_arm")
-    volume = volume_of(scene)
-    model = tissue_model_of(scene, volume)
+    volume = load_volume(scene)
+    model = build_tissue_model(scene, volume)
     mesh = model.mesh
     present, fractions = label_fractions(mesh, volume.labels, volume.patient_to_index)
     middle = np.abs(mesh.nodes[mesh.tetrahedra].mean(axis=1)[:, 1]) < 0.004

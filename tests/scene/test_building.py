@@ -12,11 +12,11 @@ from old_gmsh import as_vtu
 
 from us_sim.errors import MeshError, SceneError
 from us_sim.scene.building import (
-    blood_of,
+    build_blood,
+    build_structures,
+    build_tissue_model,
+    load_volume,
     require_labels,
-    structures_of,
-    tissue_model_of,
-    volume_of,
 )
 from us_sim.scene.reading import load_scene, parse_scene
 from us_sim.tissue.model import face_nodes
@@ -62,7 +62,7 @@ def organ(folder):
 
 def test_a_mesh_from_a_file_takes_the_place_of_the_box(organ):
     notes = []
-    model = tissue_model_of(organ, volume_of(organ), notes.append)
+    model = build_tissue_model(organ, load_volume(organ), notes.append)
     assert len(model.mesh.tetrahedra) == 2524
     held = int(model.fixed.sum())
     assert notes == [f"tissue mesh: fixed: `bottom` holds {held} of 642 nodes"]
@@ -75,9 +75,9 @@ def test_a_mesh_from_a_file_takes_the_place_of_the_box(organ):
 
 
 def test_structures_end_where_an_organ_ends(organ):
-    volume = volume_of(organ)
-    mesh = tissue_model_of(organ, volume).mesh
-    made = {one.name: one for one in structures_of(organ, volume, mesh, 20_000)}
+    volume = load_volume(organ)
+    mesh = build_tissue_model(organ, volume).mesh
+    made = {one.name: one for one in build_structures(organ, volume, mesh, 20_000)}
     assert list(made) == ["vein", "vessel"]
     assert made["vessel"].colour == (0.5, 0.25, 0.75)
     for one in made.values():
@@ -85,7 +85,7 @@ def test_structures_end_where_an_organ_ends(organ):
         reach = 0.5 * np.linalg.norm(np.ptp(mesh.nodes[mesh.tetrahedra], axis=1), axis=1).max()
         assert (surface.vertices > mesh.nodes.min(axis=0) - reach).all()
         assert (surface.vertices < mesh.nodes.max(axis=0) + reach).all()
-        np.testing.assert_array_equal(surface.carry(mesh.nodes), surface.vertices)
+        np.testing.assert_array_equal(surface.deform_vertices(mesh.nodes), surface.vertices)
 
 
 def test_a_surface_from_a_file_is_placed_in_its_unit_and_pose(small_scene, tmp_path):
@@ -97,15 +97,15 @@ def test_a_surface_from_a_file_is_placed_in_its_unit_and_pose(small_scene, tmp_p
         "    pose: {position: [0, 0, 20 mm]}\n"
     )
     placed = load_scene(scene)
-    volume = volume_of(placed)
-    (tile,) = structures_of(placed, volume, tissue_model_of(placed, volume).mesh, 100)
+    volume = load_volume(placed)
+    (tile,) = build_structures(placed, volume, build_tissue_model(placed, volume).mesh, 100)
     expected = np.array([[-0.005, 0, 0.02], [0, 0.008, 0.02], [0.005, 0, 0.02]])
     order = np.lexsort(tile.surface.vertices.T[::-1])
     np.testing.assert_allclose(tile.surface.vertices[order], expected, atol=1e-9)
 
 
 def test_labels_that_are_not_there_are_named(organ):
-    volume = volume_of(organ)
+    volume = load_volume(organ)
     unknown = parse_scene(
         DOCUMENT
         | {
@@ -124,9 +124,9 @@ def test_a_mesh_in_the_wrong_unit_or_of_a_surface_is_refused(organ, folder):
         return parse_scene(DOCUMENT | {"tissue": tissue}, folders=[folder])
 
     with pytest.raises(MeshError, match=r"truthcylinder1\.vtu: .*35\.6 m"):
-        tissue_model_of(scene({"file": "truthcylinder1.vtu"}), volume_of(organ))
+        build_tissue_model(scene({"file": "truthcylinder1.vtu"}), load_volume(organ))
     with pytest.raises(MeshError, match=r"liver\.vtk: .*tetrahedral"):
-        tissue_model_of(scene({"file": "liver.vtk"}), volume_of(organ))
+        build_tissue_model(scene({"file": "liver.vtk"}), load_volume(organ))
 
 
 FLOW = {"kind": "venous", "direction": [0, -1, 0], "peak_velocity": 0.2, "mean_velocity": 0.07}
@@ -146,7 +146,7 @@ def scene_with(tmp_path, small_scene):
 
 def test_the_arm_has_blood_in_its_vein_and_its_artery():
     scene = load_scene("upper_arm")
-    blood = blood_of(scene, volume_of(scene))
+    blood = build_blood(scene, load_volume(scene))
     assert [vessel.name for vessel in blood.vessels] == ["structures.vein", "structures.artery"]
     vein, artery = blood.vessels
     # The phantom's own radii, which its seed changes by up to 4 %.
@@ -159,7 +159,7 @@ def test_the_arm_has_blood_in_its_vein_and_its_artery():
 def test_a_flow_of_another_label_than_its_structures_name(scene_with):
     scene = scene_with(structures={"deep": {"label": "artery", "flow": FLOW}})
     assert list(scene.flows) == ["deep"]
-    assert blood_of(scene, volume_of(scene)).vessels[0].areas.mean() < 3e-5
+    assert build_blood(scene, load_volume(scene)).vessels[0].areas.mean() < 3e-5
     assert "with blood in deep" in scene.parts()[3].reason
 
 
@@ -173,7 +173,7 @@ def test_a_flow_of_another_label_than_its_structures_name(scene_with):
 def test_what_cannot_flow_is_refused_with_file_key_and_reason(scene_with, name, own, fact):
     scene = scene_with(structures={name: {"flow": FLOW | own}})
     with pytest.raises(SceneError, match=rf"^{scene.origin}: structures\.{fact}"):
-        blood_of(scene, volume_of(scene))
+        build_blood(scene, load_volume(scene))
 
 
 @pytest.mark.parametrize(

@@ -11,18 +11,18 @@ from us_sim.errors import SceneError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.scene.building import (
-    colour_of,
-    path_of,
-    scanner_of,
-    structures_of,
-    tissue_model_of,
-    volume_of,
+    build_scanner,
+    build_structures,
+    build_tissue_model,
+    load_path,
+    load_volume,
+    structure_colour,
 )
-from us_sim.scene.case_tissue import keep_tissue
+from us_sim.scene.case_tissue import cache_tissue
 from us_sim.scene.reading import check_files, load_scene
 from us_sim.scoring.exercise import read_exercise
 from us_sim.scoring.live import LiveScan
-from us_sim.settings.reading import Reader
+from us_sim.settings.reading import SettingsReader
 from us_sim.tissue.solvers.solver import create_solver
 from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.cases.writing import new_case, write_case_settings
@@ -57,7 +57,7 @@ def cases(tmp_path_factory) -> Path:
     structures = {"vein": CaseStructure(6), "rib": CaseStructure(2)}
     settings = CaseSettings(
         "block",
-        probe=Reader("probe").read(ProbeSettings, probe),
+        probe=SettingsReader("probe").read(ProbeSettings, probe),
         start=CaseStart((0.0, 0.0, 0.0), TURN),
         structures=structures,
         press=7e-3,
@@ -80,20 +80,20 @@ def root(cases, monkeypatch, tmp_path):
 def test_a_case_alone_is_a_whole_scene(cases):
     scene = load_scene("case:block")
     assert scene.origin == f"case:{cases / 'block'}"
-    assert [part.node for part in scene.parts() if part.needed] == [
+    assert [part.node for part in scene.list_parts() if part.needed] == [
         "probe_tracker",
         "tissue_deformer",
         "slice_interpolator",
     ]
-    volume = volume_of(scene)
+    volume = load_volume(scene)
     # The probe's z is the volume's x: the vein, 16 to 22 mm deep there, is so in `patient`.
     centre = volume.patient_to_index @ [0.0, 0.0, 0.019, 1.0]
     assert volume.labels[tuple(np.rint(centre[:3]).astype(int))] == 6
-    path = path_of(scene, Path(scene.path))
+    path = load_path(scene, Path(scene.path))
     assert path.positions[:, 2].max() == pytest.approx(7e-3)
     assert scene.tissue.fixed == ("bottom", "rib")
     assert scene.tissue.materials["vein"].lumen_pressure == 1e3
-    assert colour_of(scene, "vein") == (0.25, 0.4, 0.85)
+    assert structure_colour(scene, "vein") == (0.25, 0.4, 0.85)
 
 
 @pytest.mark.slow
@@ -101,7 +101,7 @@ def test_a_thrombus_in_a_cases_vein_keeps_it_open_and_an_exercise_knows_of_it(tm
     """A structure of a case that is called after its vein is a thrombus, with no word more."""
     numbers = {"vein": 6, "vein thrombus": 8, "rib": 2}
     for name, volume in (("clot", block(8)), ("free", block())):
-        probe = Reader("probe").read(ProbeSettings, {"aperture": "30 mm", "depth": "40 mm"})
+        probe = SettingsReader("probe").read(ProbeSettings, {"aperture": "30 mm", "depth": "40 mm"})
         settings = CaseSettings(
             name,
             probe=probe,
@@ -118,19 +118,19 @@ def test_a_thrombus_in_a_cases_vein_keeps_it_open_and_an_exercise_knows_of_it(tm
     seen = {}
     for name in ("clot", "free"):
         scene = load_scene(f"case:{tmp_path / name}")
-        volume = volume_of(scene)
-        model = tissue_model_of(scene, volume)
+        volume = load_volume(scene)
+        model = build_tissue_model(scene, volume)
         solver = create_solver("fem", model)
-        scanner = scanner_of(scene, volume)
-        scanner.carry(model.mesh.nodes, model.mesh.tetrahedra)
-        live = LiveScan(volume, scanner_of(scene, volume), exercise)
+        scanner = build_scanner(scene, volume)
+        scanner.attach_mesh(model.mesh.nodes, model.mesh.tetrahedra)
+        live = LiveScan(volume, build_scanner(scene, volume), exercise)
         for k, depth in enumerate((0.0, 0.001, 0.001, 0.006, 0.012, 0.018, 0.001)):
             pose = Pose([0.0, 0.0, depth])
             nodes = solver.deform(pose).nodes
             live.add_pose(float(k), pose)
             live.add_force(float(k), np.array([0.0, 0.0, -1e3 * depth]))
-            live.add_labels(float(k), pose, scanner.labels(pose, nodes))
-        score = live.score()
+            live.add_labels(float(k), pose, scanner.render_labels(pose, nodes))
+        score = live.compute_score()
         (step,) = score.steps
         metrics = {each.name: each.value for each in score.metrics}
         least = metrics["Smallest Part of the Area at Rest"]
@@ -141,8 +141,8 @@ def test_a_thrombus_in_a_cases_vein_keeps_it_open_and_an_exercise_knows_of_it(tm
 
 def test_its_tissue_has_the_structures_materials_and_what_is_held():
     scene = load_scene("case:block")
-    volume = volume_of(scene)
-    model = tissue_model_of(scene, volume)
+    volume = load_volume(scene)
+    model = build_tissue_model(scene, volume)
     assert len(model.mesh.nodes) <= 1000
     low, high = model.mesh.nodes.min(axis=0), model.mesh.nodes.max(axis=0)
     # As wide as the volume or the probe with what is beside it; as deep as the image is.
@@ -151,13 +151,13 @@ def test_its_tissue_has_the_structures_materials_and_what_is_held():
     vein = model.materials.lumen_fraction @ model.mesh.volumes
     assert vein == pytest.approx(6e-3 * 8e-3 * 60e-3, rel=0.05)
     assert model.fixed[model.mesh.nodes[:, 2] > 41e-3].all()
-    (vein,) = structures_of(scene, volume, model.mesh, 2000)  # the rib is below the tissue
+    (vein,) = build_structures(scene, volume, model.mesh, 2000)  # the rib is below the tissue
     assert (vein.name, vein.colour) == ("vein", (0.25, 0.4, 0.85))
 
 
 def test_planes_lie_close_where_the_vein_is():
     scene = load_scene("case:block")
-    x, _, z = tissue_model_of(scene, volume_of(scene)).mesh.planes
+    x, _, z = build_tissue_model(scene, load_volume(scene)).mesh.planes
     steps, middle = np.diff(z), (z[1:] + z[:-1]) / 2
     in_vein = (middle > 16e-3) & (middle < 22e-3)
     assert in_vein.sum() >= 2
@@ -173,19 +173,19 @@ def test_tissue_is_made_once_and_made_anew_when_what_it_is_made_from_changes(
     cache = tmp_path / "cache"
     monkeypatch.setenv("US_SIM_CACHE", str(cache))
     scene = load_scene(f"case:{tmp_path / 'block'}")
-    volume = volume_of(scene)
-    before = tissue_model_of(scene, volume)
+    volume = load_volume(scene)
+    before = build_tissue_model(scene, volume)
     (entry,) = cache.glob("tissue-*/")
     written = entry.stat().st_mtime_ns
-    keep_tissue(scene, volume)
-    again = tissue_model_of(scene, volume)
+    cache_tissue(scene, volume)
+    again = build_tissue_model(scene, volume)
     assert entry.stat().st_mtime_ns == written
     np.testing.assert_array_equal(again.mesh.nodes, before.mesh.nodes)
     np.testing.assert_array_equal(again.materials.young_modulus, before.materials.young_modulus)
     case = tmp_path / "block" / "case.yaml"
     case.write_text(case.read_text().replace("nodes: 1000", "nodes: 1500"))
     finer = load_scene(f"case:{tmp_path / 'block'}")
-    assert 1000 < len(tissue_model_of(finer, volume).mesh.nodes) <= 1500
+    assert 1000 < len(build_tissue_model(finer, volume).mesh.nodes) <= 1500
     assert len(list(cache.glob("tissue-*/"))) == 2
 
 
@@ -223,7 +223,7 @@ def test_a_volume_and_a_tissue_of_its_own_may_take_a_cases_volume(tmp_path, case
     )
     scene = load_scene(file)
     assert scene.volume.case == str(cases / "block")
-    assert volume_of(scene).labels is not None
+    assert load_volume(scene).labels is not None
     assert scene.volume.name == "case block"
 
 
@@ -254,7 +254,7 @@ PROBE = "probe: {depth: 4 cm, aperture: 3 cm}\n"
 def test_wrong_cases_are_refused_in_a_sentence_that_names_the_scene(tmp_path, text, fact):
     def build(file):
         scene = load_scene(file)
-        tissue_model_of(scene, volume_of(scene))
+        build_tissue_model(scene, load_volume(scene))
 
     file = scene_file(tmp_path, text)
     with pytest.raises(UsSimError, match=f"{file}.*{fact}"):

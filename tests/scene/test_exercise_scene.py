@@ -3,9 +3,9 @@
 import pytest
 
 from us_sim.errors import SceneError
-from us_sim.scene.listing import listed_scenes
+from us_sim.scene.listing import list_scenes
 from us_sim.scene.reading import load_scene
-from us_sim.scoring.exercise import installed_exercises
+from us_sim.scoring.exercise import read_installed_exercises
 
 EXAMINATION = "name: e\nscene: upper_arm_drawn\nfeedback: afterwards\nseeds: [3, 3]\n"
 
@@ -51,9 +51,9 @@ def test_a_seed_that_is_none_is_refused(name):
 
 
 def test_the_lesson_is_listed_first_and_in_its_order():
-    lesson = [each.lesson for each in installed_exercises() if each.lesson]
+    lesson = [each.lesson for each in read_installed_exercises() if each.lesson]
     assert lesson == [1, 2, 3, 4, 5]
-    listed = [each for each in listed_scenes() if each.kind == "exercise"]
-    assert [each.name for each in listed[:5]] == [e.name for e in installed_exercises()[:5]]
-    for each in installed_exercises():
+    listed = [each for each in list_scenes() if each.kind == "exercise"]
+    assert [each.name for each in listed[:5]] == [e.name for e in read_installed_exercises()[:5]]
+    for each in read_installed_exercises():
         load_scene(f"exercise:{each.origin}")

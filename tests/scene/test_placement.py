@@ -13,9 +13,14 @@ from us_sim.command.main import main
 from us_sim.errors import SceneError
 from us_sim.geometry.pose import Pose
 from us_sim.recording.path import write_path
-from us_sim.recording.press_and_slide import press_and_slide
-from us_sim.scene.building import probe_of, tissue_model_of, volume_of
-from us_sim.scene.placement import check_path_in_volume, part_inside, probe_pose, rest_placement
+from us_sim.recording.press_and_slide import make_press_and_slide
+from us_sim.scene.building import build_probe, build_tissue_model, load_volume
+from us_sim.scene.placement import (
+    build_rest_placement,
+    check_path_in_volume,
+    compute_part_inside,
+    find_probe_pose,
+)
 from us_sim.scene.reading import load_scene, parse_scene
 from us_sim.slicing.cutting.slicer import create_slicer
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe
@@ -23,7 +28,7 @@ from us_sim.tissue.solvers.solver import create_solver
 from us_sim.volume.cases.case import read_case
 from us_sim.volume.files.readers import read_volume
 from us_sim.volume.files.writing import write_volume
-from us_sim.volume.reconstruction.reconstruction import plan, reconstruct
+from us_sim.volume.reconstruction.reconstruction import plan_insertion, reconstruct
 from us_sim.volume.reconstruction.settings import Compounding, ImagePart
 from us_sim.volume.sequences.sweep import read_sweep
 from us_sim.volume.volume import Volume
@@ -36,15 +41,15 @@ ACROSS = np.linspace(-0.012, 0.012, 25)  # m, of the probe along its elevation
 def pressed(small_scene, tmp_path_factory):
     """The scene, its volume, and a sweep of images that the pressing probe sees."""
     scene = load_scene(small_scene)
-    volume, probe = volume_of(scene), probe_of(scene)
-    model = tissue_model_of(scene, volume)
+    volume, probe = load_volume(scene), build_probe(scene)
+    model = build_tissue_model(scene, volume)
     solver = create_solver("fem", model)
     mesh = model.mesh
     slicer = create_slicer("scan_conversion", volume, mesh.nodes, mesh.tetrahedra)
     images, matrices = [], []
     for y in ACROSS:
         pose = Pose([0.0, float(y), PRESS])
-        images.append(slicer.image(solver.deform(pose).nodes, probe.plane(pose)))
+        images.append(slicer.cut_image(solver.deform(pose).nodes, probe.make_plane(pose)))
         # Columns along the probe's x, rows along its z: the third step completes the frame.
         columns, rows = probe.image_to_probe[:3, 0], probe.image_to_probe[:3, 1]
         matrix = np.eye(4)
@@ -72,9 +77,9 @@ def difference(made, volume):
 def test_undoing_the_pressure_brings_the_tissue_back(pressed):
     scene, volume, sweep = pressed
     how = Compounding(spacing=volume_spacing(volume))
-    as_seen = reconstruct(plan(sweep, how))
-    rest = rest_placement(scene, sweep, ImagePart())
-    at_rest = reconstruct(plan(sweep, how, rest=rest))
+    as_seen = reconstruct(plan_insertion(sweep, how))
+    rest = build_rest_placement(scene, sweep, ImagePart())
+    at_rest = reconstruct(plan_insertion(sweep, how, rest=rest))
     seen, seen_correlation = difference(as_seen, volume)
     undone, undone_correlation = difference(at_rest, volume)
     # Measured: 26.1 and 18.7 grey levels, correlations of 0.29 and 0.76, most of it of speckle.
@@ -88,7 +93,7 @@ def volume_spacing(volume):
 
 def test_points_come_back_to_where_they_were(pressed):
     scene, _, sweep = pressed
-    rest = rest_placement(scene, sweep, ImagePart())
+    rest = build_rest_placement(scene, sweep, ImagePart())
     mesh = rest.solver.model.mesh
     nodes = rest.solver.deform(rest.poses[3]).nodes
     inner = np.flatnonzero(np.linalg.norm(mesh.nodes - [0, 0, 0.025], axis=1) < 0.02)
@@ -99,7 +104,7 @@ def test_points_come_back_to_where_they_were(pressed):
 
 def test_the_probe_is_where_its_image_begins(pressed):
     _, _, sweep = pressed
-    pose = probe_pose(sweep.image_to_reference[4], ImagePart(), sweep.columns)
+    pose = find_probe_pose(sweep.image_to_reference[4], ImagePart(), sweep.columns)
     np.testing.assert_allclose(pose.position, [0.0, ACROSS[4], PRESS], atol=1e-9)
     np.testing.assert_allclose(pose.rotation, np.eye(3), atol=1e-9)
 
@@ -107,7 +112,7 @@ def test_the_probe_is_where_its_image_begins(pressed):
 def test_a_scene_without_tissue_is_refused(pressed):
     scene, _, sweep = pressed
     with pytest.raises(SceneError, match="tissue"):
-        rest_placement(dataclasses.replace(scene, tissue=None), sweep, ImagePart())
+        build_rest_placement(dataclasses.replace(scene, tissue=None), sweep, ImagePart())
 
 
 @pytest.mark.slow
@@ -118,8 +123,8 @@ def test_the_command_places_images_at_rest(pressed, small_scene, tmp_path, capsy
     assert main([*words, "--undo-pressure", str(small_scene)]) == 0
     assert "from 25 frames" in capsys.readouterr().out
     how = Compounding(spacing=1e-3)
-    rest = rest_placement(scene, sweep, ImagePart())
-    made = reconstruct(plan(sweep, how, rest=rest))
+    rest = build_rest_placement(scene, sweep, ImagePart())
+    made = reconstruct(plan_insertion(sweep, how, rest=rest))
     np.testing.assert_array_equal(read_volume(out).intensities, made.volume.intensities)
     assert made.volume.shape[2] > 40  # the probe's depth of 40 mm, and what it had pressed down
     words[words.index(str(out))] = str(tmp_path / "rest")
@@ -135,7 +140,7 @@ PROBE = {"aperture": "40 mm", "depth": "40 mm", "image": [200, 200]}
 @pytest.fixture
 def path(tmp_path):
     file = tmp_path / "press.mcap"
-    write_path(file, press_and_slide(rate=6.0), sidecar=False)
+    write_path(file, make_press_and_slide(rate=6.0), sidecar=False)
     return file
 
 
@@ -169,7 +174,7 @@ def test_the_part_inside_is_that_of_the_rectangle(shift, part):
     probe = LinearProbe(aperture=0.04, depth=0.04, columns=400, rows=400)
     grid = np.diag([1e3, 1e3, 1e3, 1.0])
     grid[:3, 3] = [19.5, 20, -0.5]  # x from -20 to 20 mm, z from 0 to 40 mm
-    (found,) = part_inside(probe, [Pose([shift, 0, 0])], grid, (40, 40, 40))
+    (found,) = compute_part_inside(probe, [Pose([shift, 0, 0])], grid, (40, 40, 40))
     assert found == pytest.approx(part, abs=0.04)
 
 
@@ -179,7 +184,7 @@ def test_the_corners_that_no_beam_reaches_do_not_count():
     )
     grid = np.diag([1e3, 1e3, 1e3, 1.0])
     grid[:3, 3] = [-30.5, 10, 100]  # all that is beyond x = 30 mm
-    (found,) = part_inside(probe, [Pose()], grid, (500, 50, 500))
+    (found,) = compute_part_inside(probe, [Pose()], grid, (500, 50, 500))
     angle, radius = np.meshgrid(
         np.linspace(-1, 1, 801) * np.pi / 6, np.linspace(0.05, 0.15, 801), indexing="ij"
     )

@@ -10,12 +10,12 @@ import yaml
 
 from us_sim.errors import SceneError, UsSimError
 from us_sim.geometry.collider import Sphere
-from us_sim.scene.building import collider_of, probe_of
+from us_sim.scene.building import build_collider, build_probe
 from us_sim.scene.reading import load_scene, parse_scene
 from us_sim.scene.scene import ImagingSettings
 from us_sim.share import shared_path
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
-from us_sim.slicing.settings import Strain
+from us_sim.slicing.settings import StrainSettings
 from us_sim.tissue.mesh.tetrahedral_mesh import MeshSettings
 from us_sim.volume.sequences.sweep import read_sweep
 
@@ -108,24 +108,24 @@ def scene_with_probe(**probe):
 
 
 def test_a_linear_probe_has_512_by_512_pixels_unless_told():
-    probe = probe_of(scene_with_probe(aperture="4 cm", depth="3 cm", focus="2 cm", lines=128))
+    probe = build_probe(scene_with_probe(aperture="4 cm", depth="3 cm", focus="2 cm", lines=128))
     assert isinstance(probe, LinearProbe)
     assert (probe.columns, probe.rows, probe.lines) == (512, 512, 128)
     assert (probe.aperture, probe.depth, probe.focus) == pytest.approx((0.04, 0.03, 0.02))
-    square = probe_of(scene_with_probe(aperture="4 cm", depth="3 cm", image=300))
+    square = build_probe(scene_with_probe(aperture="4 cm", depth="3 cm", image=300))
     assert (square.columns, square.rows) == (400, 300)
 
 
 def test_fans_have_square_pixels_unless_told():
     convex = {"geometry": "convex", "radius": "60 mm", "opening_angle": "60 deg", "depth": "14 cm"}
-    probe = probe_of(scene_with_probe(**convex))
+    probe = build_probe(scene_with_probe(**convex))
     assert isinstance(probe, ConvexProbe)
     assert (probe.width, probe.rows) == pytest.approx((0.2, 512))
     assert probe.pixel_spacing[0] == pytest.approx(probe.pixel_spacing[1], rel=1e-3)
-    probe = probe_of(scene_with_probe(**convex, image=[200, 100], samples=300))
+    probe = build_probe(scene_with_probe(**convex, image=[200, 100], samples=300))
     assert (probe.columns, probe.rows, probe.samples) == (200, 100, 300)
     sector = {"geometry": "sector", "opening_angle": "90°", "depth": "16 cm", "aperture": "2 cm"}
-    probe = probe_of(scene_with_probe(**sector, radius="5 mm", image=400))
+    probe = build_probe(scene_with_probe(**sector, radius="5 mm", image=400))
     assert isinstance(probe, SectorProbe)
     assert (probe.radius, probe.rows) == (0.005, 400)
     assert probe.width == pytest.approx(0.01 + 0.16 * 2**0.5)
@@ -175,7 +175,7 @@ def test_the_liver_scene_is_the_middle_frame_of_the_sweep_that_made_its_volume(s
     folder = shared_data / "imfusion-liver-sweep"
     scene = load_scene("liver_sweep", volume=folder / "liver_sweep_compounded_1mm.mha")
     recorded = liver_sweep.probe()
-    probe = probe_of(scene)
+    probe = build_probe(scene)
     assert probe.radius == pytest.approx(recorded.radius, abs=1e-5)
     assert probe.depth == pytest.approx(recorded.depth, abs=1e-5)
     assert probe.opening_angle == pytest.approx(recorded.opening_angle, abs=1e-5)
@@ -195,7 +195,7 @@ def test_a_scene_says_only_what_differs_from_the_one_it_is_based_on(tmp_path):
     file.write_text("name: mine\nbased_on: far/base.yaml\nprobe: {depth: 3 cm}\nskin: null")
     scene, arm = load_scene(file), load_scene("upper_arm")
     assert (scene.name, scene.origin) == ("mine", str(file))
-    assert probe_of(scene) == dataclasses.replace(probe_of(arm), depth=0.03)
+    assert build_probe(scene) == dataclasses.replace(build_probe(arm), depth=0.03)
     assert scene.probe.collider == arm.probe.collider
     assert scene.skin is None
     assert scene.tissue == arm.tissue
@@ -209,8 +209,8 @@ def test_another_kind_of_probe_does_not_inherit_the_dimensions_of_the_base_s(tmp
         "opening_angle: 60 deg, collider: {shape: sphere, radius: 3 cm}}"
     )
     scene = load_scene(file)
-    assert (probe_of(scene).radius, probe_of(scene).depth) == (0.05, 0.04)
-    assert collider_of(scene) == Sphere(0.03)
+    assert (build_probe(scene).radius, build_probe(scene).depth) == (0.05, 0.04)
+    assert build_collider(scene) == Sphere(0.03)
 
 
 TETRAHEDRON = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n"
@@ -287,7 +287,7 @@ def test_strain_needs_tissue():
         "volume": {"phantom": "upper_arm"},
         "probe": {"aperture": 0.04, "depth": 0.04},
     }
-    assert parse_scene(bare | {"strain": {}}).strain == Strain()
+    assert parse_scene(bare | {"strain": {}}).strain == StrainSettings()
     with pytest.raises(SceneError, match=r"strain: .*`tissue`"):
         parse_scene(bare | {"strain": {"since": "image"}})
     with pytest.raises(UsSimError, match=r"strain\.interval: 0 .* 1 to 60"):

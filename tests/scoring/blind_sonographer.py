@@ -12,9 +12,9 @@ import time
 import numpy as np
 from scipy.ndimage import gaussian_filter, label
 
-from us_sim.environment.simulation import Simulation
+from us_sim.environment.simulation import ScanSimulation
 from us_sim.geometry.pose import Pose
-from us_sim.scene.building import scanner_of
+from us_sim.scene.building import build_scanner
 from us_sim.scene.reading import load_scene
 from us_sim.scoring.exercise import read_exercise
 from us_sim.scoring.live import LiveScan
@@ -50,10 +50,10 @@ class Hand:
     """The probe on an arm; every frame is scored as it comes."""
 
     def __init__(self, scene):
-        self.simulation = Simulation(scene)
+        self.simulation = ScanSimulation(scene)
         volume = self.simulation.volume
         exercise = read_exercise(scene.exercise)
-        self.scan = LiveScan(volume, scanner_of(scene, volume), exercise)
+        self.scan = LiveScan(volume, build_scanner(scene, volume), exercise)
         self.time = 0.0
 
     def look(self, place, press, frames=1):
@@ -92,11 +92,11 @@ def examine_arm(seed):
     hand.look([0.0, 0.0], -0.01, 3)
     line = hand.scan.lines["vein"]
     task = read_exercise(scene.exercise).assigned
-    places = [line.at(at) for at in task.places(float(line.lengths[-1]))]
+    places = [line.interpolate_point(at) for at in task.places(float(line.lengths[-1]))]
     answers = [hand.examine(place) for place in places]
     held = [str(k) for k, answer in enumerate(answers, 1) if answer == NOT_COMPRESSIBLE]
-    hand.scan.answer(answers, held[len(held) // 2] if held else NO_THROMBUS)
-    score = hand.scan.score()
+    hand.scan.set_answers(answers, held[len(held) // 2] if held else NO_THROMBUS)
+    score = hand.scan.compute_score()
     return all(step.is_done for step in score.steps), answers, score.steps
 
 

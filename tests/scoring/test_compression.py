@@ -8,7 +8,7 @@ import pytest
 from us_sim.errors import ScoreError
 from us_sim.scoring.centre_line import CentreLine
 from us_sim.scoring.exercise import Exercise, read_exercise
-from us_sim.scoring.metrics import Force, Scan, Section
+from us_sim.scoring.metrics import Force, Scan, VesselSection
 from us_sim.scoring.motion import Motion
 
 POINTS = (0.01, 0.03, 0.05)  # m along a vein of 6 cm, of which 8 mm are left out at both ends
@@ -39,7 +39,7 @@ def scanned(keys, clot=None, *, beside=False, artery=1.0, rate=5.0):
 
     def section(part):
         straight, middle = np.full(count, np.pi / 2), np.zeros(count)
-        return Section(times, 1e-5 * part, np.full(count, 1e-5), place, straight, middle)
+        return VesselSection(times, 1e-5 * part, np.full(count, 1e-5), place, straight, middle)
 
     return Scan(
         Motion(times, positions, [[0, 0, 0, 1]] * count),
@@ -71,21 +71,21 @@ def examination(points=POINTS, newtons=(9.0,) * 3):
 def attempt(seen, **task):
     exercise = read_exercise("compression")
     changed = replace(exercise.assigned, **task)
-    made = Exercise("x", replace(exercise.task, given=changed)).begin(seen.lines)
-    made.add(seen)
+    made = Exercise("x", replace(exercise.task, given=changed)).begin_attempt(seen.lines)
+    made.add_scan(seen)
     return made
 
 
 def done(seen, **task):
-    return [step.is_done for step in attempt(seen, **task).steps()]
+    return [step.is_done for step in attempt(seen, **task).list_steps()]
 
 
 def test_a_vein_that_is_closed_at_every_point_is_examined():
     made = attempt(scanned(examination()))
-    assert [step.is_done for step in made.steps()] == [True] * 3
-    assert np.allclose([step.target[0] for step in made.steps()], LINE.points[[10, 30, 50]])
+    assert [step.is_done for step in made.list_steps()] == [True] * 3
+    assert np.allclose([step.target[0] for step in made.list_steps()], LINE.points[[10, 30, 50]])
     assert not made.faults
-    assert made.seconds() == pytest.approx(15.0, abs=1.2)  # from the first touch
+    assert made.compute_duration() == pytest.approx(15.0, abs=1.2)  # from the first touch
 
 
 def test_the_probe_slides_lightly_or_is_lifted_from_point_to_point():
@@ -94,8 +94,8 @@ def test_the_probe_slides_lightly_or_is_lifted_from_point_to_point():
     )
     assert done(scanned(way), lift_between=True) == [True] * 3
     made = attempt(scanned(examination()), lift_between=True)
-    assert [step.is_done for step in made.steps()] == [True, False, False]
-    assert "lift" in made.steps()[1].seen
+    assert [step.is_done for step in made.list_steps()] == [True, False, False]
+    assert "lift" in made.list_steps()[1].seen
 
 
 def bad(name):
@@ -141,26 +141,26 @@ def test_sliding_and_too_much_force_are_said_at_once_and_stand_in_the_result():
     assert all(word in fault.what for word, fault in zip(words, made.faults, strict=True))
     early = attempt(scanned(keys[:6]))  # while the force is there
     assert "over 20 N" in early.faults[0].what
-    assert "over 20 N" in early.steps()[0].seen
+    assert "over 20 N" in early.list_steps()[0].seen
 
 
 def test_a_bad_press_can_be_made_good():
     keys = [*examination(newtons=(9.0, 25.0, 9.0)), *press(POINTS[1]), (1, POINTS[1], 0.5)]
     made = attempt(scanned(keys))
-    assert [step.is_done for step in made.steps()] == [True] * 3
+    assert [step.is_done for step in made.list_steps()] == [True] * 3
     assert len(made.faults) == 1
 
 
 def test_a_point_is_done_when_the_vein_is_open_again():
     keys = examination()[:6]
-    step = attempt(scanned(keys)).steps()[0]
+    step = attempt(scanned(keys)).list_steps()[0]
     assert not step.is_done
     assert "let go" in step.seen
 
 
 def test_a_point_that_was_missed_or_not_closed_is_not_done():
     assert done(scanned(examination((0.01, 0.03, 0.04)))) == [True, True, False]
-    soft = attempt(scanned(examination(newtons=(9.0, 5.0, 9.0)))).steps()
+    soft = attempt(scanned(examination(newtons=(9.0, 5.0, 9.0)))).list_steps()
     assert [step.is_done for step in soft] == [True, False, True]
     assert [step.is_missed for step in soft] == [False, True, False]
     assert "not pressed enough" in soft[1].seen
@@ -185,8 +185,8 @@ def test_without_force_a_closed_vein_is_still_closed():
 def test_a_scene_that_is_loaded_under_a_pressed_probe_scores_nothing():
     pressed = [(0, POINTS[0], 0.5), *press(POINTS[0])]
     made = attempt(scanned([*pressed, *lift(POINTS[0])]))
-    assert not any(step.is_done for step in made.steps())
-    assert made.seconds() is None
+    assert not any(step.is_done for step in made.list_steps())
+    assert made.compute_duration() is None
     assert done(scanned([*pressed, *lift(POINTS[0]), *examination()])) == [True] * 3
 
 
@@ -215,17 +215,17 @@ def test_a_place_that_is_not_there_is_refused(points, said):
 def test_in_pieces_it_is_the_same_as_at_once(cut):
     seen = scanned(bad("too hard, and sliding while pressed") + examination()[2:])
     whole = attempt(seen)
-    parts = read_exercise("compression").begin(seen.lines)
-    parts.add(until(seen, cut))
-    parts.add(replace(seen, since=cut))
-    assert [step[:3] for step in parts.steps()] == [step[:3] for step in whole.steps()]
+    parts = read_exercise("compression").begin_attempt(seen.lines)
+    parts.add_scan(until(seen, cut))
+    parts.add_scan(replace(seen, since=cut))
+    assert [step[:3] for step in parts.list_steps()] == [step[:3] for step in whole.list_steps()]
     assert parts.faults == whole.faults
-    assert parts.seconds() == whole.seconds()
+    assert parts.compute_duration() == whole.compute_duration()
 
 
 def until(seen, end):
     def cut(section):
-        return Section(*(values[section.times <= end] for values in vars(section).values()))
+        return VesselSection(*(values[section.times <= end] for values in vars(section).values()))
 
     keep, kept = seen.motion.times <= end, seen.force.times <= end
     motion = seen.motion
@@ -240,10 +240,10 @@ def until(seen, end):
 def blind(seen, points=("compressible",) * 3, thrombus="none", **task):
     exercise = replace(read_exercise("compression"), feedback="afterwards")
     changed = replace(exercise.assigned, **task)
-    made = replace(exercise, task=replace(exercise.task, given=changed)).begin(seen.lines)
-    made.add(seen)
-    hidden = made.steps()
-    made.answer(points, thrombus, seen.motion.times[-1])
+    made = replace(exercise, task=replace(exercise.task, given=changed)).begin_attempt(seen.lines)
+    made.add_scan(seen)
+    hidden = made.list_steps()
+    made.set_answers(points, thrombus, seen.motion.times[-1])
     return hidden, made
 
 
@@ -257,7 +257,7 @@ def test_a_blind_examination_tells_nothing_until_all_is_answered():
     assert not any(word in told for word in ("thrombus:", "open", "closed", "vein", "%"))
     assert not any(step.is_done for step in hidden)
     assert made.ended is not None
-    assert [step.is_done for step in made.steps()] == [True] * 4
+    assert [step.is_done for step in made.list_steps()] == [True] * 4
 
 
 @pytest.mark.parametrize(
@@ -270,33 +270,33 @@ def test_a_blind_examination_tells_nothing_until_all_is_answered():
 )
 def test_wrong_answers_are_held_against_the_truth(points, thrombus, right):
     seen = scanned(examination(newtons=(9.0, 12.0, 9.0)), clot=CLOT)
-    assert [step.is_done for step in blind(seen, points, thrombus)[1].steps()] == right
+    assert [step.is_done for step in blind(seen, points, thrombus)[1].list_steps()] == right
 
 
 def test_right_answers_without_an_examination_do_not_pass():
     seen = scanned(bad("without scanning"))
     made = blind(seen)[1]
-    assert [step.is_done for step in made.steps()] == [False, False, False, True]
-    assert "not examined" in made.steps()[0].seen
+    assert [step.is_done for step in made.list_steps()] == [False, False, False, True]
+    assert "not examined" in made.list_steps()[0].seen
 
 
 def test_an_answer_ends_a_blind_attempt_only_when_all_are_there():
     _, made = blind(scanned(examination()), ("compressible", "-", "compressible"))
     assert made.ended is None
-    made.answer(("compressible",) * 3, "none", 20.0)
-    assert [step.is_done for step in made.steps()] == [True] * 4
+    made.set_answers(("compressible",) * 3, "none", 20.0)
+    assert [step.is_done for step in made.list_steps()] == [True] * 4
     with pytest.raises(ScoreError, match="ended"):
-        made.answer(("compressible",) * 3, "1", 21.0)
+        made.set_answers(("compressible",) * 3, "1", 21.0)
 
 
 def test_what_comes_late_of_before_the_last_answer_counts():
     seen = scanned(examination())
     exercise = replace(read_exercise("compression"), feedback="afterwards")
-    made = exercise.begin(seen.lines)
-    made.add(until(seen, 8.0))
-    made.answer(("compressible",) * 3, "none", seen.motion.times[-1])
-    made.add(replace(seen, since=8.0))
-    assert [step.is_done for step in made.steps()] == [True] * 4
+    made = exercise.begin_attempt(seen.lines)
+    made.add_scan(until(seen, 8.0))
+    made.set_answers(("compressible",) * 3, "none", seen.motion.times[-1])
+    made.add_scan(replace(seen, since=8.0))
+    assert [step.is_done for step in made.list_steps()] == [True] * 4
 
 
 @pytest.mark.parametrize(
@@ -309,6 +309,6 @@ def test_an_answer_that_is_none_is_refused(points, thrombus):
 
 def test_where_all_is_said_at_once_nothing_is_asked():
     with pytest.raises(ScoreError, match="asks nothing"):
-        attempt(scanned(examination())).answer(("compressible",), "", 0.0)
+        attempt(scanned(examination())).set_answers(("compressible",), "", 0.0)
     with pytest.raises(ScoreError, match="compression"):
         replace(read_exercise("keep_force"), feedback="afterwards")

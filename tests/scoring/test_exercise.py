@@ -8,7 +8,7 @@ import pytest
 from us_sim.errors import ScoreError
 from us_sim.scoring.centre_line import CentreLine
 from us_sim.scoring.exercise import Exercise, read_exercise
-from us_sim.scoring.metrics import Force, Scan, Section
+from us_sim.scoring.metrics import Force, Scan, VesselSection
 from us_sim.scoring.motion import Motion
 from us_sim.share import shared_roots
 
@@ -28,7 +28,7 @@ def scan(left=(0.0, 0.0, 0.0), artery=(0.9, 0.9, 0.9), newtons=(6.0, 6.0, 6.0), 
     def section(least):
         area = 1e-5 * (1 - np.outer(1 - np.array(least), PRESS).ravel())
         straight, middle = np.full(count, np.pi / 2), np.zeros(count)
-        return Section(times, area, np.full(count, 1e-5), along, straight, middle)
+        return VesselSection(times, area, np.full(count, 1e-5), along, straight, middle)
 
     return Scan(
         motion,
@@ -41,7 +41,7 @@ def scan(left=(0.0, 0.0, 0.0), artery=(0.9, 0.9, 0.9), newtons=(6.0, 6.0, 6.0), 
 def steps(name, seen, **task):
     exercise = read_exercise(name)
     changed = replace(exercise.assigned, **task)
-    return Exercise("x", replace(exercise.task, given=changed)).steps(seen)
+    return Exercise("x", replace(exercise.task, given=changed)).evaluate_scan(seen)
 
 
 def done(name, seen, **task):
@@ -105,7 +105,7 @@ def test_every_installed_exercise_can_be_read_and_is_of_a_scene_with_its_vessels
     files = [f for root in shared_roots() for f in (root / "config/exercises").glob("*.yaml")]
     assert {file.stem for file in files} >= {"compression", "keep_force"}
     for file in files:
-        assert read_exercise(file).steps(scan())
+        assert read_exercise(file).evaluate_scan(scan())
 
 
 @pytest.mark.parametrize(

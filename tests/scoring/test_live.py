@@ -8,7 +8,7 @@ import pytest
 from us_sim.geometry.pose import Pose
 from us_sim.scoring.exercise import read_exercise
 from us_sim.scoring.live import LiveScan
-from us_sim.scoring.metrics import metrics_of
+from us_sim.scoring.metrics import compute_metrics
 from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.volume.volume import Volume
 
@@ -88,16 +88,16 @@ def test_the_score_so_far_is_that_of_all_samples_so_far(name):
     exercise = read_exercise(name)
     told = set()
     for scan in scanned(exercise, 1, 24):
-        metrics, steps, faults, seconds = scan.score()[:4]
-        whole = scan.scan()
-        attempt = exercise.begin(whole.lines)
-        attempt.add(whole)
-        assert (faults, seconds) == (attempt.faults, attempt.seconds())
-        expected = list(metrics_of(whole))
+        metrics, steps, faults, seconds = scan.compute_score()[:4]
+        whole = scan.build_scan()
+        attempt = exercise.begin_attempt(whole.lines)
+        attempt.add_scan(whole)
+        assert (faults, seconds) == (attempt.faults, attempt.compute_duration())
+        expected = list(compute_metrics(whole))
         assert [each.label for each in metrics] == [each.label for each in expected]
         for found, known in zip(metrics, expected, strict=True):
             assert found.value == pytest.approx(known.value, rel=1e-9, nan_ok=True), found.label
-        for step, known in zip(steps, attempt.steps(), strict=True):
+        for step, known in zip(steps, attempt.list_steps(), strict=True):
             assert step[:3] == known[:3]
             told.add(step.seen)
     assert len(told) >= 3  # something went on

@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 
 from us_sim.errors import ScoreError
-from us_sim.scoring.metrics import Force, Scan, Section, metrics_of
+from us_sim.scoring.metrics import Force, Scan, VesselSection, compute_metrics
 from us_sim.scoring.motion import Motion
 from us_sim.scoring.settings import ScoreSettings
 
 
 def table(scan, settings=None):
-    return {(m.name, m.roles.rpartition(" = ")[2]): m.value for m in metrics_of(scan, settings)}
+    return {
+        (m.name, m.roles.rpartition(" = ")[2]): m.value for m in compute_metrics(scan, settings)
+    }
 
 
 def circle(seconds=4.0, radius=0.03, count=4001):
@@ -53,7 +55,9 @@ def test_a_press_of_a_triangle():
     assert found["Peak Probe Force", "Probe"] == 20.0
     assert found["Time above 15 N", "Probe"] == pytest.approx(1.0, rel=1e-2)
     assert found["Force Impulse", "Probe"] == pytest.approx(40.0, rel=1e-6)
-    assert force.at(np.array([-1.0, 2.0, 7.0])) == pytest.approx([np.nan, 10, np.nan], nan_ok=True)
+    assert force.interpolate_at(np.array([-1.0, 2.0, 7.0])) == pytest.approx(
+        [np.nan, 10, np.nan], nan_ok=True
+    )
 
 
 def test_a_face_that_goes_round_scans_a_ring_where_it_touches():
@@ -66,7 +70,7 @@ def test_a_face_that_goes_round_scans_a_ring_where_it_touches():
 
 def test_the_areas_of_a_vessel():
     nan = np.nan
-    section = Section(
+    section = VesselSection(
         np.arange(4.0),
         1e-6 * np.array([20.0, 5.0, 1.0, 4.0]),
         1e-6 * np.array([20.0, 20.0, nan, 16.0]),

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from us_sim.errors import ScoreError
 from us_sim.geometry.mesh_file import read_with_meshio
-from us_sim.scoring.metrics import Scan, metrics_of
+from us_sim.scoring.metrics import Scan, compute_metrics
 from us_sim.scoring.motion import Motion
 
 NEEDLE = 0.3  # m, TissueDamage.NEEDLE_LENGTH; it points along +z, as its evaluator has by default
@@ -27,7 +27,7 @@ def motion(times, matrices):
 
 
 def table(moved):
-    return {metric.name: metric.value for metric in metrics_of(Scan(moved))}
+    return {metric.name: metric.value for metric in compute_metrics(Scan(moved))}
 
 
 def shown(times, time, tolerance=1e-3):
@@ -134,7 +134,7 @@ def tissue_metrics(moved, matrices, surface):
     entry = first_hits(moved.positions, base, triangles)
     times, speeds = moved.steps[inside[1:]], moved.speeds[inside[1:]]
     return {
-        "Tissue Damage": MM2 * moved.swept_area(entry, inside),
+        "Tissue Damage": MM2 * moved.compute_swept_area(entry, inside),
         "Path in Tissue": MM * speeds @ times,
         "Time in Tissue": times.sum(),
     }
@@ -201,9 +201,11 @@ def test_a_line_that_moves_sideways_sweeps_a_rectangle():
     y = np.linspace(0, 0.03, 7)
     positions = np.stack([0 * y, y, 0 * y], axis=1)
     moved = Motion(np.arange(7.0), positions, np.tile([0, 0, 0, 1], (7, 1)))
-    assert moved.swept_area(np.add(positions, [0.04, 0, 0])) == pytest.approx(0.04 * 0.03)
+    assert moved.compute_swept_area(np.add(positions, [0.04, 0, 0])) == pytest.approx(0.04 * 0.03)
     where = [True] * 3 + [False] * 4
-    assert moved.swept_area(np.add(positions, [0.04, 0, 0]), where) == pytest.approx(0.04 * 0.01)
+    assert moved.compute_swept_area(np.add(positions, [0.04, 0, 0]), where) == pytest.approx(
+        0.04 * 0.01
+    )
 
 
 @pytest.mark.parametrize(

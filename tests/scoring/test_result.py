@@ -9,14 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from us_sim.errors import ScoreError
-from us_sim.scoring.class_table import class_table, write_class
+from us_sim.scoring.class_table import tabulate_results, write_class_table
 from us_sim.scoring.exercise import Step
 from us_sim.scoring.live import Score
 from us_sim.scoring.metrics import Metric
 from us_sim.scoring.result import (
-    plain_metrics,
-    result_page,
-    state_of,
+    classify_attempt,
+    render_page,
+    select_plain_metrics,
 )
 from us_sim.scoring.result_place import KEPT_FOLDER, ResultPlace, read_results
 
@@ -45,14 +45,14 @@ def test_the_five_plain_metrics_come_first():
         Metric("Time above 20 N", "s", 0.25),
     ]
     score = Score(metrics, [Step("a", True, ""), Step("b", False, "")], (), 52.21)
-    assert [(each.label, each.brief) for each in plain_metrics(score, 20.0)] == [
+    assert [(each.label, each.brief) for each in select_plain_metrics(score, 20.0)] == [
         ("Time, s", "52.2"),
         ("Highest force, N", "9.88"),
         ("Time above 20 N, s", "0.25"),
         ("Way of the probe, mm", "1.23e+03"),
         ("Points right, of 2", "1"),
     ]
-    assert np.isnan(plain_metrics(Score([]), 20.0)[0].value)
+    assert np.isnan(select_plain_metrics(Score([]), 20.0)[0].value)
 
 
 @pytest.mark.parametrize(
@@ -67,11 +67,11 @@ def test_the_five_plain_metrics_come_first():
     ],
 )
 def test_what_became_of_an_attempt(score, void, state):
-    assert state_of(score, void) == state
+    assert classify_attempt(score, void) == state
 
 
 def test_a_page_has_all_and_no_markup_of_a_name():
-    page = result_page(result(), b"\x89PNG")
+    page = render_page(result(), b"\x89PNG")
     assert "<h1>Compression &lt;of&gt; the vein</h1><h2>Not passed</h2>" in page
     assert all(word in page for word in ("9.81", "slid", "iVBORw==", "<summary>More", "Ada"))
 
@@ -137,8 +137,8 @@ def test_results_that_a_place_refuses_are_kept_until_it_takes_them(tmp_path, mon
 def test_the_table_of_a_class_has_a_row_for_each_attempt(tmp_path):
     begun = [f"2026-11-29T07:0{k}:00+00:00" for k in range(3)]
     results = [result("Ada", begun[0], 1), result("Bob", begun[1], 3), result("Ada", begun[2], 3)]
-    table = class_table(results)
-    csv, page = write_class(table, tmp_path / "out")
+    table = tabulate_results(results)
+    csv, page = write_class_table(table, tmp_path / "out")
     kept = pd.read_csv(csv)
     assert list(kept["student"]) == ["Ada", "Bob", "Ada"]
     assert list(kept["right"]) == [1, 3, 3]

@@ -21,14 +21,14 @@ from us_sim.settings import quantity as quantities
 from us_sim.settings import registry
 from us_sim.settings.choice import Choice
 from us_sim.settings.quantity import Quantity
-from us_sim.settings.reading import Reader
-from us_sim.settings.setting import Rule, Settings, kinds_of, rules_of
+from us_sim.settings.reading import SettingsReader
+from us_sim.settings.setting import SettingRule, Settings, kinds_of, rules_of
 from us_sim.tissue.mesh.tetrahedral_mesh import MeshSettings
 
 for choice in vars(registry).values():
     if isinstance(choice, Choice) and choice is not registry.PHANTOMS:
         for option in choice:
-            choice.settings(option)
+            choice.load_settings(option)
 
 
 def kinds_below(kind: type[Settings]) -> Iterator[type[Settings]]:
@@ -38,7 +38,7 @@ def kinds_below(kind: type[Settings]) -> Iterator[type[Settings]]:
         yield from kinds_below(below)
 
 
-def strategy(kind: Any, rule: Rule) -> st.SearchStrategy[Any] | None:
+def strategy(kind: Any, rule: SettingRule) -> st.SearchStrategy[Any] | None:
     """Values that will do for a setting; None for what is not a number, text, truth or list."""
     if get_origin(kind) in (Union, UnionType):
         made = [strategy(k, rule) if k is not type(None) else st.none() for k in get_args(kind)]
@@ -108,7 +108,7 @@ def written(made: Settings) -> dict[str, Any]:
     }
 
 
-def applies(made: Settings, rule: Rule) -> bool:
+def applies(made: Settings, rule: SettingRule) -> bool:
     """Whether a setting means something beside the others."""
     assert rule.applies
     other, values = rule.applies
@@ -131,12 +131,12 @@ def test_what_is_written_is_read_back_and_a_copy_is_the_same(kind, data):
         assume(False)  # values that do not go together
     idle = {n for n, rule in rules_of(kind).items() if rule.applies and not applies(made, rule)}
     document = {n: value for n, value in written(made).items() if n not in idle}
-    assert Reader("my.yaml").read(kind, document) == made
+    assert SettingsReader("my.yaml").read(kind, document) == made
     assert dataclasses.replace(made) == made
     assert dataclasses.replace(made, **{n: getattr(made, n) for n in rules_of(kind)}) == made
 
 
-def wrong_values(kind: Any, rule: Rule) -> list[Any]:
+def wrong_values(kind: Any, rule: SettingRule) -> list[Any]:
     """Values that a setting must refuse; none for what is not a number, text, truth or list."""
     if get_origin(kind) in (Union, UnionType):
         wrong = [each for k in get_args(kind) for each in wrong_values(k, rule)]

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from us_sim.settings.quantity import Quantity, amount
+from us_sim.settings.quantity import Quantity, format_quantity
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def test_what_is_not_finite(number):
     st.floats(-1e13, 1e13, allow_subnormal=False),
 )
 def test_what_is_written_is_read_back(dimension, value):
-    back = Quantity(dimension).parse(amount(value, dimension))
+    back = Quantity(dimension).parse(format_quantity(value, dimension))
     assert math.isclose(back, value, rel_tol=1e-12)
 
 
@@ -57,4 +57,4 @@ def test_what_is_written_is_read_back(dimension, value):
     ],
 )
 def test_the_unit_is_the_one_that_people_use(value, dimension, text):
-    assert amount(value, dimension) == text
+    assert format_quantity(value, dimension) == text

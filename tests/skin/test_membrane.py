@@ -8,9 +8,9 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
-from us_sim.geometry.collider_distance import signed_distance
+from us_sim.geometry.collider_distance import measure_distances
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.triangles import TriangleParts, part_size
+from us_sim.geometry.triangles import TriangleParts, choose_part_size
 from us_sim.skin.membrane import CONTACT_TOLERANCE, SHORTEST, SkinMembrane, spring_forces
 from us_sim.skin.settings import MembraneSettings
 from us_sim.skin.surface import TriangleSurface, bent_surface, plane_surface
@@ -72,7 +72,7 @@ def parts_of(sheet, collider):
     """Parts of triangles that are all alike."""
     corners = sheet.vertices[sheet.triangles]
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-    size = part_size(collider.offset_box[3], float(np.median(sides)))
+    size = choose_part_size(collider.offset_box[3], float(np.median(sides)))
     return TriangleParts(sides.max(axis=1), size)
 
 
@@ -100,7 +100,7 @@ def test_no_edge_of_the_probe_comes_through_between_the_particles(tilt):
     for depth in np.linspace(0.0, 0.012, 25):
         pose = Pose([0.0, 0.0, depth], turn)
         found = skin.deform(pose)
-        gap, _ = signed_distance(collider, pose, places_between(sheet, found.vertices))
+        gap, _ = measure_distances(collider, pose, places_between(sheet, found.vertices))
         assert gap.min() > -0.4e-3
     assert settled(skin, pose).residual < 1e-3
 
@@ -194,16 +194,16 @@ def test_nothing_is_inside_the_probe_as_it_presses_and_slides(collider):
     for k in range(40):
         pose = Pose([1e-3 * k - 0.02, 5e-4 * k, min(5e-4 * k, 0.01)], [0.02 * k / 40, 0.1, 0, 1])
         found = skin.deform(pose)
-        distance, _ = signed_distance(collider, pose, found.vertices)
+        distance, _ = measure_distances(collider, pose, found.vertices)
         assert distance.min() >= -CONTACT_TOLERANCE
         assert np.isfinite(found.vertices).all()
         np.testing.assert_allclose(np.linalg.norm(found.normals, axis=1), 1.0, atol=1e-12)
     assert found.residual < 0.5
     at_rest = settled(skin, pose)
     assert at_rest.residual < 1e-3
-    distance, _ = signed_distance(collider, pose, at_rest.vertices)
+    distance, _ = measure_distances(collider, pose, at_rest.vertices)
     assert distance.min() >= -CONTACT_TOLERANCE
-    distance, _ = signed_distance(collider, pose, places_between(sheet, at_rest.vertices))
+    distance, _ = measure_distances(collider, pose, places_between(sheet, at_rest.vertices))
     assert distance.min() > -1e-4
     assert (np.abs(distance) < 1e-4).sum() > 100
 

@@ -7,7 +7,7 @@ import pytest
 from sphere_surface import sphere
 
 from us_sim.errors import MeshError
-from us_sim.geometry.triangles import vertex_normals
+from us_sim.geometry.triangles import compute_vertex_normals
 from us_sim.skin.surface import TriangleSurface, bent_surface, plane_surface, read_surface
 
 
@@ -17,7 +17,7 @@ def ball(radius):
 
 def test_normals_of_a_sphere_point_away_from_its_centre():
     round_ = ball(0.05)
-    normals = vertex_normals(round_.vertices, round_.triangles)
+    normals = compute_vertex_normals(round_.vertices, round_.triangles)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-12)
     assert np.einsum("ij,ij->i", normals, round_.vertices / 0.05).min() > np.cos(np.radians(1.0))
 
@@ -31,7 +31,7 @@ def test_a_flat_sheet_lies_in_z_0_and_faces_out_of_the_body():
     np.testing.assert_allclose(sheet.vertices.min(axis=0), [-0.1, -0.05, 0], atol=1e-15)
     np.testing.assert_allclose(sheet.vertices.max(axis=0), [0.1, 0.05, 0], atol=1e-15)
     np.testing.assert_array_equal(
-        vertex_normals(sheet.vertices, sheet.triangles), np.tile([0, 0, -1.0], (231, 1))
+        compute_vertex_normals(sheet.vertices, sheet.triangles), np.tile([0, 0, -1.0], (231, 1))
     )
 
 
@@ -49,7 +49,7 @@ def test_a_bent_sheet_is_flat_and_then_two_arcs_downwards():
     # A quarter circle on each side ends where it points straight down.
     assert np.abs(x).max() == pytest.approx(flat / 2 + radius)
     assert z.max() == pytest.approx(radius)
-    normals = vertex_normals(sheet.vertices, sheet.triangles)
+    normals = compute_vertex_normals(sheet.vertices, sheet.triangles)
     outward = np.column_stack([np.sign(x) * (np.abs(x) - flat / 2), 0 * x, z - radius])[side]
     outward /= np.linalg.norm(outward, axis=1)[:, None]
     assert np.einsum("ij,ij->i", normals[side], outward).min() > np.cos(np.radians(3))

@@ -136,7 +136,7 @@ def _deformed(rng, nodes, strength):
     moved = nodes + np.column_stack([0 * dent, 0 * dent, dent])
     moved += rng.uniform(-1.0, 1.0, nodes.shape) * strength * 0.012
     turn = Pose(rng.normal(scale=0.003, size=3), [*rng.normal(scale=0.15, size=3), 1.0])
-    return turn.apply(moved)
+    return turn.transform_points(moved)
 
 
 def _counts(rng):
@@ -211,15 +211,15 @@ def _aligned(rng, volume):
     rest = mesh.nodes
     if rng.random() < 0.3:
         # The rest turned as well: pixels on the surface that tissue moved away from.
-        rest = turn.apply(mesh.nodes)
+        rest = turn.transform_points(mesh.nodes)
     plane = SlicePlane(
-        turn.apply(origin[None])[0],
+        turn.transform_points(origin[None])[0],
         turn.rotation @ directions[across] * pixel / share,
         turn.rotation @ directions[down] * pixel / share,
         columns=columns,
         rows=rows,
     )
-    return Case(rest, mesh.tetrahedra.copy(), turn.apply(nodes), plane, volume)
+    return Case(rest, mesh.tetrahedra.copy(), turn.transform_points(nodes), plane, volume)
 
 
 def _fan(rng, plane):

@@ -36,7 +36,7 @@ def pressed(nodes):
 @pytest.fixture(scope="module")
 def scanner():
     scanner = BMode(arm(), LINEAR)
-    scanner.carry(MESH.nodes, MESH.tetrahedra)
+    scanner.attach_mesh(MESH.nodes, MESH.tetrahedra)
     return scanner
 
 
@@ -56,7 +56,7 @@ def test_all_of_a_frame_comes_from_one_cut_in_any_order(scanner, probe, first, m
     rest = frame.located.rest_index()
     assert len(cuts) == (1 if first == "pixels" else 2)
     to_index = frame.volume.patient_to_index
-    expected = slicer.rest_coordinates(nodes, plane) @ to_index[:3, :3].T + to_index[:3, 3]
+    expected = slicer.compute_rest_coordinates(nodes, plane) @ to_index[:3, :3].T + to_index[:3, 3]
     np.testing.assert_allclose(rest, expected, atol=1e-9)
     assert frame.pixels is frame.pixels
 
@@ -81,25 +81,29 @@ def test_labels_are_of_the_middle_plane_and_of_the_beams(scanner, imaging):
 @every_method
 def test_every_method_says_which_tetrahedron_a_pixel_is_in(method):
     nodes = pressed(MESH.nodes)
-    plane = LINEAR.plane(POSE)
+    plane = LINEAR.make_plane(POSE)
     slicer = create_slicer(method, arm(), MESH.nodes, MESH.tetrahedra)
-    slicer.image(nodes, plane)
-    located = slicer.locate(nodes, plane)
+    slicer.cut_image(nodes, plane)
+    located = slicer.locate_pixels(nodes, plane)
     inside = (located.elements >= 0) & (located.elements < len(located.tetrahedra))
     assert 0.5 < inside.mean() < 1.0
     corners = nodes[MESH.tetrahedra[located.tetrahedra[located.elements[inside]]]]
     edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
-    weights = np.linalg.solve(edges, (plane.pixels()[inside] - corners[:, 0])[..., None])[..., 0]
+    weights = np.linalg.solve(
+        edges, (plane.compute_pixel_positions()[inside] - corners[:, 0])[..., None]
+    )[..., 0]
     assert weights.min() > -1e-6
     assert weights.sum(axis=1).max() < 1 + 1e-6
     rest = MESH.nodes[MESH.tetrahedra[located.tetrahedra[located.elements[inside]]]]
     at = rest[:, 0] + np.einsum("ni,nij->nj", weights, rest[:, 1:] - rest[:, :1])
     to_index = arm().patient_to_index
     expected = at @ to_index[:3, :3].T + to_index[:3, 3]
-    np.testing.assert_allclose(located.rest_index()[inside], expected, atol=1e-9)
+    np.testing.assert_allclose(located.compute_rest_index()[inside], expected, atol=1e-9)
     outside = located.elements == len(located.tetrahedra)
-    pixel_index = plane.pixels() @ to_index[:3, :3].T + to_index[:3, 3]
-    np.testing.assert_allclose(located.rest_index()[outside], pixel_index[outside], atol=1e-9)
+    pixel_index = plane.compute_pixel_positions() @ to_index[:3, :3].T + to_index[:3, 3]
+    np.testing.assert_allclose(
+        located.compute_rest_index()[outside], pixel_index[outside], atol=1e-9
+    )
 
 
 def test_what_cannot_be_known_of_a_frame_is_said(scanner):
@@ -109,19 +113,19 @@ def test_what_cannot_be_known_of_a_frame_is_said(scanner):
     with pytest.raises(MeshError, match="3 deformed nodes"):
         _ = scanner.frame(POSE, MESH.nodes[:3]).pixels
     bare = BMode(Volume(arm().intensities, arm().index_to_patient), LINEAR)
-    bare.carry(MESH.nodes, MESH.tetrahedra)
+    bare.attach_mesh(MESH.nodes, MESH.tetrahedra)
     for nodes in (None, MESH.nodes):
         with pytest.raises(VolumeError, match="has no labels"):
-            _ = bare.frame(POSE, nodes).labels
+            _ = bare.make_frame(POSE, nodes).labels
 
 
 @every_method
 def test_labels_follow_nodes_that_were_written_to_after_an_image(method):
-    plane, nodes = LINEAR.plane(POSE), MESH.nodes.copy()
+    plane, nodes = LINEAR.make_plane(POSE), MESH.nodes.copy()
     slicer = create_slicer(method, arm(), MESH.nodes, MESH.tetrahedra)
-    slicer.image(nodes, plane)
-    before = slicer.labels(nodes, plane)
+    slicer.cut_image(nodes, plane)
+    before = slicer.cut_labels(nodes, plane)
     nodes[:] = pressed(nodes)
-    expected = create_slicer(method, arm(), MESH.nodes, MESH.tetrahedra).labels(nodes, plane)
+    expected = create_slicer(method, arm(), MESH.nodes, MESH.tetrahedra).cut_labels(nodes, plane)
     assert (expected != before).any()
-    np.testing.assert_array_equal(slicer.labels(nodes, plane), expected)
+    np.testing.assert_array_equal(slicer.cut_labels(nodes, plane), expected)

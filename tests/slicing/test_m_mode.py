@@ -21,7 +21,7 @@ def test_a_wall_that_moves_is_where_it_was_at_each_moment():
         row = 30 + round(20 * np.sin(2 * np.pi * k / rate))
         image[:] = 0
         image[row] = 250
-        picture = m_mode.show(image, 100.0 + k / rate)
+        picture = m_mode.draw_sweep(image, 100.0 + k / rate)
     grey = picture[:ROWS, :COLUMNS, 0]
     brightest = (grey.argmax(axis=0) + 0.5) / ROWS * 60 - 0.5
     times = (np.arange(COLUMNS) - (COLUMNS - 1)) * SWEEP / COLUMNS
@@ -38,7 +38,7 @@ def picture(rows=32, columns=100, sweep=2.0):
 def test_moments_follow_each_other_evenly_and_none_is_there_twice(steps, start):
     made = picture()
     asked = start + np.concatenate([[0.0], np.cumsum(steps)])
-    moments = np.concatenate([made.moments(time) for time in asked])
+    moments = np.concatenate([made.advance_to(time) for time in asked])
     assert np.diff(moments) == pytest.approx(0.02, abs=1e-6)
     assert moments[-1] <= asked[-1] + 1e-6
     assert moments[-1] > asked[-1] - 0.02 - 1e-6
@@ -46,10 +46,10 @@ def test_moments_follow_each_other_evenly_and_none_is_there_twice(steps, start):
 
 def test_it_begins_anew_when_time_goes_back_or_stops_for_long():
     made = picture()
-    made.add(np.full((32, len(made.moments(10.0))), 255, np.uint8))
+    made.append_columns(np.full((32, len(made.advance_to(10.0))), 255, np.uint8))
     assert made.grey[:, -1].all()
-    assert len(made.moments(5.0)) == 1
+    assert len(made.advance_to(5.0)) == 1
     assert not made.grey.any()
-    made.add(np.full((32, 1), 255, np.uint8))
-    assert len(made.moments(60.0)) == 1
+    made.append_columns(np.full((32, 1), 255, np.uint8))
+    assert len(made.advance_to(60.0)) == 1
     assert not made.grey.any()

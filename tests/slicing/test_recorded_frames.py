@@ -47,28 +47,28 @@ def test_real_frames_are_found_again_in_the_volume(liver):
     width = 2 * round(2e-3 / liver_sweep.SPACING) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
     chosen = range(0, len(sweep.numbers), 10)
-    for index, image in zip(chosen, sweep.images(chosen), strict=True):
-        plane = probe.plane(liver_sweep.probe_pose(sweep.image_to_reference[index]))
+    for index, image in zip(chosen, sweep.read_images(chosen), strict=True):
+        plane = probe.make_plane(liver_sweep.probe_pose(sweep.image_to_reference[index]))
         recorded, simulated = (
             liver_sweep.on_probe_pixels(image, probe),
-            slicer.image(mesh.nodes, plane),
+            slicer.cut_image(mesh.nodes, plane),
         )
-        seen = ((sample_plane(support, plane) == 255) & plane.is_shown()).astype(np.uint8)
+        seen = ((sample_plane(support, plane) == 255) & plane.make_shown_mask()).astype(np.uint8)
         border = {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}
         compared = cv2.erode(seen, disc, **border).astype(bool)
         smoothed = cv2.GaussianBlur(recorded.astype(np.float32), (0, 0), 1e-3 / liver_sweep.SPACING)
-        assert compared.sum() / plane.is_shown().sum() > 0.85
+        assert compared.sum() / plane.make_shown_mask().sum() > 0.85
         alike = correlation(recorded, simulated, compared)
         assert 0.8 < alike < correlation(smoothed, simulated, compared)
         # The wrong way round must not reach it, or the number would say nothing.
         both = compared & compared[:, ::-1]
         assert correlation(smoothed, simulated[:, ::-1], both) < 0.8
-        rigid = np.where(plane.is_shown(), sample_plane(volume, plane), np.uint8(0))
+        rigid = np.where(plane.make_shown_mask(), sample_plane(volume, plane), np.uint8(0))
         assert np.abs(simulated.astype(int) - rigid).max() <= 1
 
 
 def test_the_fan_is_where_the_real_frames_are_lit(liver):
-    brightest = np.max(list(read_sweep(liver[1]).images(range(0, 140, 5))), axis=0)
+    brightest = np.max(list(read_sweep(liver[1]).read_images(range(0, 140, 5))), axis=0)
     row, column = np.mgrid[: brightest.shape[0], : brightest.shape[1]]
     x, z = column - liver_sweep.COLUMN, row - liver_sweep.ROW + liver_sweep.RADIUS
     way = np.hypot(x, z) - liver_sweep.RADIUS  # pixels, from the face

@@ -14,7 +14,7 @@ from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.cutting.slicer import create_slicer
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
-from us_sim.slicing.strain import AxialStrain, displacement
+from us_sim.slicing.strain import AxialStrain, compute_displacement
 from us_sim.slicing.strain_estimate import warm_up
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.volume.volume import Volume
@@ -40,8 +40,8 @@ MESH = block()
 
 def framed(probe, pose, nodes, mesh=MESH):
     scanner = BMode(VOLUME, probe)
-    scanner.carry(mesh.nodes, mesh.tetrahedra)
-    return scanner.frame(pose, nodes)
+    scanner.attach_mesh(mesh.nodes, mesh.tetrahedra)
+    return scanner.make_frame(pose, nodes)
 
 
 def turned(turn):
@@ -65,14 +65,14 @@ def beams_of(frame):
 def test_a_homogeneous_deformation_strains_every_beam_as_its_gradient_does(probe, turn, gradient):
     stretch = np.eye(3) + np.array(gradient).reshape(3, 3)
     frame = framed(probe, turned(turn), MESH.nodes @ stretch.T)
-    found = AxialStrain.of(frame).image(frame)
+    found = AxialStrain.from_frame(frame).compute_strain(frame)
     assert found.dtype == np.float32
     # A unit line along the beam now was |F⁻¹ d| long.
     expected = 1.0 / np.linalg.norm(beams_of(frame) @ np.linalg.inv(stretch).T, axis=-1) - 1.0
     there = np.isfinite(found)
     assert there.mean() > 0.3
     np.testing.assert_allclose(found[there], expected[there], atol=2e-6)
-    np.testing.assert_array_equal(~there, np.isnan(displacement(frame)[..., 0]))
+    np.testing.assert_array_equal(~there, np.isnan(compute_displacement(frame)[..., 0]))
 
 
 @ALL_PROBES
@@ -81,20 +81,20 @@ def test_strain_since_another_state_is_that_of_what_happened_since(probe):
     before = MESH.nodes @ (np.eye(3) + rng.uniform(-0.1, 0.1, (3, 3))).T
     since = np.eye(3) + rng.uniform(-0.05, 0.05, (3, 3))
     frame = framed(probe, turned([0.2, -0.1, 0.1]), before @ since.T)
-    strain = AxialStrain.of(frame)
-    found = strain.image(frame, before)
+    strain = AxialStrain.from_frame(frame)
+    found = strain.compute_strain(frame, before)
     expected = 1.0 / np.linalg.norm(beams_of(frame) @ np.linalg.inv(since).T, axis=-1) - 1.0
     there = np.isfinite(found)
     np.testing.assert_allclose(found[there], expected[there], atol=2e-6)
-    np.testing.assert_allclose(strain.image(frame, frame.nodes)[there], 0.0, atol=1e-6)
-    assert np.abs(strain.image(frame)[there] - found[there]).max() > 0.01
+    np.testing.assert_allclose(strain.compute_strain(frame, frame.nodes)[there], 0.0, atol=1e-6)
+    assert np.abs(strain.compute_strain(frame)[there] - found[there]).max() > 0.01
 
 
 def test_the_uniaxial_press_of_a_block_is_the_textbooks():
     """Between frictionless plates: λ along z, λ^-ν across for small strains."""
     squeezed = MESH.nodes * [1.02, 1.02, 0.95]
     frame = framed(PROBES[0], Pose(), squeezed)
-    found = AxialStrain.of(frame).image(frame)
+    found = AxialStrain.from_frame(frame).compute_strain(frame)
     np.testing.assert_allclose(found[np.isfinite(found)], -0.05, atol=1e-6)
 
 
@@ -110,8 +110,8 @@ def test_the_error_of_a_smooth_strain_falls_with_the_square_of_the_meshs_width()
     for count in (9, 17, 33):
         mesh = block(count)
         frame = framed(PROBES[0], Pose(), bent(mesh.nodes), mesh)
-        found = AxialStrain.of(frame).image(frame)[3:-3, 3:-3].astype(float)
-        now = frame.plane.pixels()[3:-3, 3:-3].reshape(-1, 3)
+        found = AxialStrain.from_frame(frame).compute_strain(frame)[3:-3, 3:-3].astype(float)
+        now = frame.plane.compute_pixel_positions()[3:-3, 3:-3].reshape(-1, 3)
         rest = now.copy()
         for _ in range(60):  # X = x - u(X)
             rest += now - bent(rest)
@@ -171,7 +171,7 @@ def test_it_is_the_mean_of_what_vtk_says_of_the_tetrahedra(probe):
     mean = numpy_to_vtk((total / weight[:, None, None]).reshape(-1, 9), deep=True)
     mean.SetName("c")
     deformed.GetPointData().AddArray(mean)
-    pixels = frame.plane.pixels().reshape(-1, 3)
+    pixels = frame.plane.compute_pixel_positions().reshape(-1, 3)
     places, cloud = vtk.vtkPoints(), vtk.vtkPolyData()
     places.SetData(numpy_to_vtk(pixels, deep=True))
     cloud.SetPoints(places)
@@ -180,7 +180,7 @@ def test_it_is_the_mean_of_what_vtk_says_of_the_tetrahedra(probe):
     probing.SetSourceData(deformed)
     probing.Update()
     c = vtk_to_numpy(probing.GetOutput().GetPointData().GetArray("c")).reshape(-1, 3, 3)
-    found = AxialStrain.of(frame).image(frame).ravel()
+    found = AxialStrain.from_frame(frame).compute_strain(frame).ravel()
     there = np.isfinite(found) & (np.trace(c, axis1=1, axis2=2) > 0)
     assert there.sum() > 400
     d = beams_of(frame).reshape(-1, 3)
@@ -196,7 +196,7 @@ def test_tetrahedra_that_are_inside_out_do_not_count():
     nodes = mesh.nodes * [1, 1, 0.9]
     nodes[np.argmin(np.linalg.norm(mesh.nodes - [0, 0, 0.03], axis=1))] += [0, 0, 0.03]
     frame = framed(PROBES[0], Pose(), nodes, mesh)
-    found = AxialStrain.of(frame).image(frame)
+    found = AxialStrain.from_frame(frame).compute_strain(frame)
     assert frame.slicer.skipped > 0
     there = found[np.isfinite(found)]
     assert there.size
@@ -210,7 +210,7 @@ def test_directions_of_pixels_are_those_of_the_beams_through_them(probe):
     frame = framed(probe, Pose(), MESH.nodes)
     expected = beams_of(frame)[..., [0, 2]]
     reached = ~np.isnan(directions[0])
-    np.testing.assert_array_equal(reached, frame.plane.is_shown())
+    np.testing.assert_array_equal(reached, frame.plane.make_shown_mask())
     found = np.moveaxis(directions, 0, -1)
     np.testing.assert_allclose(found[reached], expected[reached], atol=1e-5)
     assert math.isclose(np.hypot(*directions)[reached].min(), 1.0, abs_tol=1e-5)
@@ -219,13 +219,13 @@ def test_directions_of_pixels_are_those_of_the_beams_through_them(probe):
 def test_what_has_no_strain_is_said():
     frame = framed(PROBES[0], Pose(), None)
     with pytest.raises(MeshError, match="no tissue"):
-        AxialStrain.of(frame)
+        AxialStrain.from_frame(frame)
     frame = framed(PROBES[0], Pose(), MESH.nodes)
     with pytest.raises(MeshError, match=r"125 nodes.*\(7, 3\)"):
-        AxialStrain.of(frame).image(frame, MESH.nodes[:7])
+        AxialStrain.from_frame(frame).compute_strain(frame, MESH.nodes[:7])
     other = AxialStrain(block(6).nodes, block(6).tetrahedra)
     with pytest.raises(MeshError, match=r"216 nodes.*\(125, 3\)"):
-        other.image(frame)
+        other.compute_strain(frame)
     warm_up()
 
 
@@ -241,7 +241,7 @@ MOVED_ANGLES = st.floats(-0.6, 0.6)
 
 def scanner(probe):
     made = BMode(VOLUME, probe)
-    made.carry(MOVED_MESH.nodes, MOVED_MESH.tetrahedra)
+    made.attach_mesh(MOVED_MESH.nodes, MOVED_MESH.tetrahedra)
     return made
 
 
@@ -255,23 +255,23 @@ def test_it_is_that_of_the_deformation_in_the_axes_of_the_probe(probe, turn, gra
     pose = Pose([0.003, -0.002, 0.004], [*np.array(turn) / 2, 1.0])
     stretch = np.eye(3) + np.array(gradient).reshape(3, 3)
     nodes = MOVED_MESH.nodes @ stretch.T + [1e-3, 2e-3, -1e-3]
-    frame = scanner(probe).frame(pose, nodes)
-    found = displacement(frame)
+    frame = scanner(probe).make_frame(pose, nodes)
+    found = compute_displacement(frame)
     assert found.shape == (25, 30, 2)
     assert found.dtype == np.float32
-    now = frame.plane.pixels()
+    now = frame.plane.compute_pixel_positions()
     rest = (now - [1e-3, 2e-3, -1e-3]) @ np.linalg.inv(stretch).T
     expected = ((now - rest) @ pose.rotation)[..., [0, 2]]
     inside = ((rest > MOVED_MESH.nodes.min(axis=0)) & (rest < MOVED_MESH.nodes.max(axis=0))).all(
         axis=-1
     )
-    inside &= frame.plane.is_shown()
+    inside &= frame.plane.make_shown_mask()
     assert inside.mean() > 0.1
     np.testing.assert_allclose(found[inside], expected[inside], atol=1e-8)
     edge = (
         (rest > MOVED_MESH.nodes.min(axis=0) - 1e-9) & (rest < MOVED_MESH.nodes.max(axis=0) + 1e-9)
     ).all(-1)
-    assert np.isnan(found[~edge | ~frame.plane.is_shown()]).all()
+    assert np.isnan(found[~edge | ~frame.plane.make_shown_mask()]).all()
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("tangled", "squashed")])
@@ -284,9 +284,9 @@ def test_it_is_where_the_method_that_tries_every_tetrahedron_says(kind):
         )
         frame = Frame(Pose(), nodes, MOVED_PROBES[0], volume, slicer)
         frame.plane = plane
-        found = displacement(frame)
-        expected = plane.pixels() - oracle.rest_coordinates(nodes, plane)
-        expected[oracle.locate(nodes, plane).elements < 0] = np.nan
+        found = compute_displacement(frame)
+        expected = plane.compute_pixel_positions() - oracle.compute_rest_coordinates(nodes, plane)
+        expected[oracle.locate_pixels(nodes, plane).elements < 0] = np.nan
         outside = np.isnan(found[..., 0])
         np.testing.assert_allclose(found[~outside], expected[~outside][:, [0, 2]], atol=1e-7)
         rigid = np.isnan(expected[..., 0]) | (np.abs(expected) < 1e-12).all(axis=-1)

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
-from us_sim.slicing.settings import Strain
-from us_sim.slicing.strain import compression
-from us_sim.slicing.strain_estimate import Earlier, estimate_strain, track
+from us_sim.slicing.settings import StrainSettings
+from us_sim.slicing.strain import measure_compression
+from us_sim.slicing.strain_estimate import FrameHistory, estimate_strain, track_displacement
 
 LINEAR = LinearProbe(aperture=0.03, depth=0.04, columns=150, rows=400, lines=128, samples=400)
 PROBES = (
@@ -19,7 +19,7 @@ PROBES = (
     ConvexProbe(radius=0.04, opening_angle=0.8, depth=0.04, columns=300, rows=300, lines=128),
     SectorProbe(aperture=0.01, opening_angle=1.2, depth=0.04, columns=300, rows=300, lines=96),
 )
-SETTINGS = Strain(search=1.5e-3)
+SETTINGS = StrainSettings(search=1.5e-3)
 
 
 def speckle(shape, seed=0):
@@ -54,7 +54,7 @@ def test_an_even_strain_along_the_beams_is_found(probe, strain):
     assert np.mean(found.strain[middle]) == pytest.approx(strain, rel=0.05, abs=2e-4)
     assert np.std(found.strain[middle]) < 0.25 * abs(strain) + 5e-4
     assert found.correlation > 0.95
-    assert compression(found.strain).mean == pytest.approx(strain, rel=0.15)
+    assert measure_compression(found.strain).mean == pytest.approx(strain, rel=0.15)
 
 
 def test_a_stiff_layer_is_seen_between_soft_ones():
@@ -66,7 +66,7 @@ def test_a_stiff_layer_is_seen_between_soft_ones():
     first, second = (map_coordinates(beams, [rows, column], order=3) for rows in (sample, before))
     probe = LinearProbe(aperture=0.03, depth=0.04, columns=128, rows=400, lines=128, samples=400)
     images = [np.clip(np.rint(each), 0, 255).astype(np.uint8) for each in (first, second)]
-    found = estimate_strain(*images, probe, Strain(search=1.5e-3, fit=4e-3)).strain
+    found = estimate_strain(*images, probe, StrainSettings(search=1.5e-3, fit=4e-3)).strain
     assert np.nanmean(found[185:215]) == pytest.approx(-0.004, abs=1.5e-3)
     for soft in (found[60:130], found[280:350]):
         assert np.nanmean(soft) == pytest.approx(-0.02, abs=2e-3)
@@ -79,7 +79,7 @@ def test_a_shift_of_all_is_found_to_a_fraction_of_a_sample(shift, seed):
     rows, columns = np.meshgrid(np.arange(20, 220.0), np.arange(40.0), indexing="ij")
     first = map_coordinates(beams, [rows, columns], order=3)
     second = map_coordinates(beams, [rows - shift, columns], order=3)
-    moved, correlation = track(first, second, window=(31, 9), search=6)
+    moved, correlation = track_displacement(first, second, window=(31, 9), search=6)
     whole = correlation > 0.0
     assert whole.mean() > 0.7
     np.testing.assert_allclose(np.median(moved[whole]), shift, atol=0.02)
@@ -96,15 +96,15 @@ def test_without_echoes_or_without_likeness_there_is_no_strain():
     found = estimate_strain(one, other, LINEAR, SETTINGS)
     assert np.isfinite(found.strain).mean() < 0.2
     assert found.correlation < 0.7
-    assert compression(np.full((3, 3), np.nan)) == (0.0, 0.0)
+    assert measure_compression(np.full((3, 3), np.nan)) == (0.0, 0.0)
 
 
 def test_an_image_is_compared_with_the_one_so_many_before_of_the_same_probe_and_mesh():
-    earlier = Earlier(lambda frame: frame.pixels)
+    earlier = FrameHistory(lambda frame: frame.pixels)
 
     def before(number, probe="linear", mesh=None):
         frame = SimpleNamespace(number=number, probe=probe, mesh=mesh, pixels=10 * number)
-        return earlier.before(frame, 2)
+        return earlier.get_before(frame, 2)
 
     assert [before(number) for number in (0, 1, 2, 3, 3)] == [None, None, 0, 10, 10]
     assert [before(number) for number in (6, 7, 8)] == [None, None, 60]  # 4 and 5 were missed

@@ -17,15 +17,15 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SOLVERS
 from us_sim.tissue import live_tissue
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import uniform_material
-from us_sim.tissue.live_tissue import LiveTissue, TissueMethod, difference
+from us_sim.tissue.elasticity.materials import make_uniform_materials
+from us_sim.tissue.live_tissue import LiveTissue, TissueMethod, measure_difference
 from us_sim.tissue.solvers.fem_cg import FemCgSettings
 
 PRESSED = Pose(np.array([0.004, 0.0, 0.008]))
 
 
 def switch(tissue, method):
-    tissue.prepare(method, "a test", wait=True)
+    tissue.prepare_method(method, "a test", wait=True)
     assert tissue.adopt_prepared()
 
 
@@ -47,7 +47,9 @@ def shapes(model):
 
 
 def test_distances_are_those_of_the_nodes():
-    apart = difference(np.zeros((4, 3)), np.array([[0, 0, 0], [3e-3, 0, 4e-3], [0, 0, 0], [0] * 3]))
+    apart = measure_difference(
+        np.zeros((4, 3)), np.array([[0, 0, 0], [3e-3, 0, 4e-3], [0, 0, 0], [0] * 3])
+    )
     assert apart.maximum == pytest.approx(5e-3)
     assert apart.rms == pytest.approx(2.5e-3)
 
@@ -57,17 +59,17 @@ def test_a_switch_jumps_by_no_more_than_the_methods_differ(model, shapes, first,
     tissue = LiveTissue(model, TissueMethod(first))
     before = converged(tissue)
     switch(tissue, TissueMethod(second))
-    own = difference(shapes[first], shapes[second]).maximum
+    own = measure_difference(shapes[first], shapes[second]).maximum
     for _ in range(40):
         after = tissue.deform(PRESSED).nodes
         # What takes over begins to push the tissue out of the probe anew.
-        assert difference(after, before).maximum <= 1.05 * own + 3e-4
+        assert measure_difference(after, before).maximum <= 1.05 * own + 3e-4
         before = after
     assert tissue.solver.name == second
 
 
 def test_two_methods_of_the_same_equations_agree_and_others_do_not(model):
-    soft = uniform_material(model.mesh, Material(10e3, 0.3, 1000.0))
+    soft = make_uniform_materials(model.mesh, Material(10e3, 0.3, 1000.0))
     tissue = LiveTissue(block((9, 5, 5), materials=soft), TissueMethod("fem_cg", "fem"))
     converged(tissue, 60)
     assert tissue.difference.maximum < 1e-5
@@ -85,7 +87,7 @@ def test_settings_reach_their_solver_and_may_change_while_it_runs(model):
     few, many = FemCgSettings(iterations=1), FemCgSettings(iterations=200)
     tissue = LiveTissue(model, TissueMethod("fem_cg", settings={"fem_cg": few}))
     loose = tissue.deform(PRESSED).residual
-    tissue.prepare(TissueMethod("fem_cg", settings={"fem_cg": many}), "fem_cg", wait=True)
+    tissue.prepare_method(TissueMethod("fem_cg", settings={"fem_cg": many}), "fem_cg", wait=True)
     assert tissue.deform(PRESSED).residual > 1e-3  # as before, until it is adopted
     assert tissue.adopt_prepared()
     assert tissue.deform(PRESSED).residual < 1e-5 < loose
@@ -93,7 +95,7 @@ def test_settings_reach_their_solver_and_may_change_while_it_runs(model):
 
 def test_another_material_takes_over_where_the_tissue_is(model):
     def constants(materials):
-        return uniform_material(model.mesh, materials["all"])
+        return make_uniform_materials(model.mesh, materials["all"])
 
     tissue = LiveTissue(model, TissueMethod("fem"), constants)
     before = tissue.deform(PRESSED)
@@ -117,25 +119,25 @@ def test_what_cannot_be_made_is_said_and_the_tissue_goes_on(model, monkeypatch, 
     tissue = LiveTissue(model, TissueMethod("fem"))
     if method.solver == "broken":
         monkeypatch.setattr(live_tissue.SOLVERS, "load", lambda _: 1 / 0)
-    tissue.prepare(method, "a test", wait=True)
+    tissue.prepare_method(method, "a test", wait=True)
     with pytest.raises(SolverError, match=word):
         tissue.adopt_prepared()
     assert tissue.solver.name == "fem"
-    assert tissue.preparing == ""
+    assert tissue.preparation_status == ""
     monkeypatch.undo()
     switch(tissue, TissueMethod("fem_cg"))
 
 
 def test_tissue_that_is_not_held_is_refused_before_anything_is_compiled(model, monkeypatch):
     loose = replace(model, fixed=np.zeros_like(model.fixed))
-    monkeypatch.setattr(live_tissue, "rehearsal_model", None)
+    monkeypatch.setattr(live_tissue, "make_small_model", None)
     for name in ("fem", "fem_cg", "fem_nonlinear"):
         with pytest.raises(SolverError, match="0 fixed nodes"):
             LiveTissue(loose, TissueMethod(name))
 
 
 class Slowly:
-    """Makes solvers when it is let, in place of `compiled_solver`."""
+    """Makes solvers when it is let, in place of `compile_solver`."""
 
     def __init__(self) -> None:
         self.begun: list[str] = []
@@ -158,14 +160,14 @@ def tissue(model):
 @pytest.fixture
 def slowly(tissue, monkeypatch):  # noqa: ARG001 - it is made before
     slowly = Slowly()
-    monkeypatch.setattr(live_tissue, "compiled_solver", slowly)
+    monkeypatch.setattr(live_tissue, "compile_solver", slowly)
     return slowly
 
 
 def test_frames_go_on_while_a_method_is_prepared(tissue, slowly):
-    tissue.prepare(TissueMethod("msds"), "msds")
+    tissue.prepare_method(TissueMethod("msds"), "msds")
     assert slowly.has_begun.acquire(timeout=20)
-    assert tissue.preparing == "preparing msds for 0 s, 25 % of factors"
+    assert tissue.preparation_status == "preparing msds for 0 s, 25 % of factors"
     assert not tissue.adopt_prepared()
     tissue.deform(PRESSED)
     assert tissue.solver.name == "fem"
@@ -173,16 +175,16 @@ def test_frames_go_on_while_a_method_is_prepared(tissue, slowly):
     tissue._thread.join(20)
     assert tissue.adopt_prepared()
     assert tissue.solver.name == "msds"
-    assert tissue.preparing == ""
+    assert tissue.preparation_status == ""
     assert not tissue.adopt_prepared()
 
 
 def test_the_newest_wins_and_those_between_are_never_made(tissue, slowly):
-    tissue.prepare(TissueMethod("msds"), "msds")
+    tissue.prepare_method(TissueMethod("msds"), "msds")
     assert slowly.has_begun.acquire(timeout=20)
     first = tissue._thread
-    tissue.prepare(TissueMethod("fem_nonlinear"), "fem_nonlinear")
-    tissue.prepare(TissueMethod("fem_cg"), "fem_cg")
+    tissue.prepare_method(TissueMethod("fem_nonlinear"), "fem_nonlinear")
+    tissue.prepare_method(TissueMethod("fem_cg"), "fem_cg")
     slowly.may_end.release(2)
     first.join(20)
     tissue._thread.join(20)
@@ -192,10 +194,10 @@ def test_the_newest_wins_and_those_between_are_never_made(tissue, slowly):
 
 
 def test_what_is_set_back_drops_what_is_prepared(tissue, slowly):
-    tissue.prepare(TissueMethod("msds"), "msds")
+    tissue.prepare_method(TissueMethod("msds"), "msds")
     assert slowly.has_begun.acquire(timeout=20)
-    tissue.prepare(TissueMethod("fem"), "")
-    assert tissue.preparing == ""
+    tissue.prepare_method(TissueMethod("fem"), "")
+    assert tissue.preparation_status == ""
     slowly.may_end.release()
     tissue._thread.join(20)
     assert not tissue.adopt_prepared()
@@ -222,7 +224,7 @@ def kernels():
     return {name: count for name, count in found.items() if name.startswith("us_sim.")}
 
 compliance._KEPT = compliance._DOUBLE = 0  # as a large tissue's
-box = TissueModel.block(nodes=(7, 7, 5))
+box = TissueModel.make_block(nodes=(7, 7, 5))
 mesh = TetrahedralMesh(box.mesh.nodes, box.mesh.tetrahedra)
 other = TissueModel(mesh, box.materials, box.fixed, box.collider, box.contact_nodes)
 presses = [(0, 0, -1), (0, 0, 4), (0, 0, 8), (4, 0, 8), (4, 0, 8), (4, 0, 2), (-9, 5, 12)]
@@ -235,8 +237,8 @@ for model, method, settings in (
     ready = kernels()
     for place in presses:
         solver.deform(Pose(position=1e-3 * np.array(place, float)))
-        solver.contact_stiffness()
-        solver.discretisation_error()
+        solver.compute_contact_stiffness()
+        solver.estimate_discretisation_error()
     solver.frame_limit = 1e-4  # no time for load steps: nodes are deep in the probe at once
     solver.deform(Pose(position=[0.0, 0.0, 0.029]))
     solver.deform(None)

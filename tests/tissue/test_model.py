@@ -7,7 +7,7 @@ from tissue_block import SOFT, block, block_mesh
 
 from us_sim.errors import MeshError
 from us_sim.geometry.collider import Sphere
-from us_sim.tissue.elasticity.materials import label_fractions, uniform_material
+from us_sim.tissue.elasticity.materials import label_fractions, make_uniform_materials
 from us_sim.tissue.mesh.file import read_mesh
 from us_sim.tissue.model import (
     FACES,
@@ -98,4 +98,6 @@ FREE = np.zeros(27, dtype=bool)
 )
 def test_models_that_do_not_fit_their_mesh_are_refused(fixed, contact, words):
     with pytest.raises(MeshError, match=words):
-        TissueModel(MESH, uniform_material(MESH, SOFT), fixed, Sphere(0.03), np.array(contact))
+        TissueModel(
+            MESH, make_uniform_materials(MESH, SOFT), fixed, Sphere(0.03), np.array(contact)
+        )

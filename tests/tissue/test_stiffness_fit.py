@@ -13,12 +13,12 @@ from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import LabelFractions, average_over_labels
 from us_sim.tissue.model import TissueModel, face_nodes
 from us_sim.tissue.stiffness_fit import (
-    Press,
+    RecordedPress,
     StiffnessSettings,
+    compute_half_widths,
     fit_stiffness,
-    interval_half_widths,
     pair_press,
-    press_wrenches,
+    simulate_wrenches,
 )
 
 TRUE = {"fat": 6e3, "muscle": 18e3}  # Pa
@@ -54,8 +54,8 @@ def press():
     depths = 0.012 * np.sin(np.pi * times / 3) ** 2 - 0.002
     places = np.column_stack([0.03 * np.cos(1.5 * times), 0.0 * times, depths])
     poses = [Pose(place) for place in places]
-    felt = press_wrenches(replace(MODEL, materials=constants(TRUE)), poses, depths)
-    return Press(times, poses, felt + TARE)
+    felt = simulate_wrenches(replace(MODEL, materials=constants(TRUE)), poses, depths)
+    return RecordedPress(times, poses, felt + TARE)
 
 
 @pytest.mark.slow
@@ -123,8 +123,8 @@ def test_intervals_are_those_of_linear_regression_or_wider():
         slopes = random.normal(size=(160, 2))
         left = random.normal(size=160)
         error = np.linalg.lstsq(slopes, left, rcond=None)[0]
-        widths = interval_half_widths(slopes, left - slopes @ error)
+        widths = compute_half_widths(slopes, left - slopes @ error)
         inside += (np.abs(error) < widths).sum()
         assert widths.max() < 0.5  # 2.36 / sqrt(160) is 0.19
     assert inside >= 0.95 * 400
-    assert interval_half_widths(np.eye(160)[:, :1] * 0.0 + [[1.0, 0.0]], left)[1] > 100
+    assert compute_half_widths(np.eye(160)[:, :1] * 0.0 + [[1.0, 0.0]], left)[1] > 100

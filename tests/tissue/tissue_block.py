@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from us_sim.evaluation.independent_forces import neo_hookean_forces
+from us_sim.evaluation.independent_forces import compute_neo_hookean_forces
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
@@ -37,7 +37,9 @@ def block(
     materials: TissueMaterials | None = None,
 ) -> TissueModel:
     """The block under a sphere of 30 mm radius, unless another collider is given."""
-    model = TissueModel.block((0.2, 0.1, 0.1), nodes, material=SOFT, collider=collider, held=held)
+    model = TissueModel.make_block(
+        (0.2, 0.1, 0.1), nodes, material=SOFT, collider=collider, held=held
+    )
     return model if materials is None else replace(model, materials=materials)
 
 
@@ -67,7 +69,7 @@ def pressed(solver: TissueSolver, pose: Pose | None, frames: int = 10) -> Deform
 def require_reaction(model: TissueModel, pose: Pose, deformation: Deformation) -> None:
     """Assert that the wrench on the probe is what the fixed nodes must be held with."""
     displacement = deformation.nodes - model.mesh.nodes
-    held = neo_hookean_forces(model.mesh, model.materials, displacement)[model.fixed]
+    held = compute_neo_hookean_forces(model.mesh, model.materials, displacement)[model.fixed]
     torque = np.cross(deformation.nodes[model.fixed] - pose.position, held).sum(axis=0)
     np.testing.assert_allclose(pose.rotation @ deformation.force, held.sum(axis=0), atol=1e-6)
     np.testing.assert_allclose(pose.rotation @ deformation.torque, torque, atol=1e-7)

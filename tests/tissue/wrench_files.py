@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.recording.schemas import jazzy_definitions, stamped
+from us_sim.recording.schemas import load_jazzy_definitions, serialize_stamped
 from us_sim.recording.topic import DEFAULT_QOS
 from us_sim.recording.writer import BagWriter
 
@@ -33,10 +33,10 @@ def write_wrenches(file: str | Path | BagWriter, record: WrenchRecord) -> None:
             write_wrenches(writer, record)
         return
     file.add_topic(record.topic, WRENCH_STAMPED, [DEFAULT_QOS])
-    types = jazzy_definitions().types
+    types = load_jazzy_definitions().types
     vector = types["geometry_msgs/msg/Vector3"]
     for stamp, wrench in zip(record.stamps.tolist(), record.wrenches.tolist(), strict=True):
         force, torque = vector(*wrench[:3]), vector(*wrench[3:])
         measured = types["geometry_msgs/msg/Wrench"](force=force, torque=torque)
-        message = stamped(WRENCH_STAMPED, stamp, record.frame_id, wrench=measured)
-        file.write(record.topic, message, stamp, stamp)
+        message = serialize_stamped(WRENCH_STAMPED, stamp, record.frame_id, wrench=measured)
+        file.write_message(record.topic, message, stamp, stamp)

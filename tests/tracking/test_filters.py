@@ -61,7 +61,7 @@ def test_along_an_axis_it_is_the_papers_scalar_filter(seed):
     axis, direction = axis / np.linalg.norm(axis), direction / np.linalg.norm(direction)
     start = Pose(orientation=rng.normal(size=4))
     poses = [
-        Pose(w * direction, se3.product(se3.rotation_exp(t * axis), start.orientation))
+        Pose(w * direction, se3.multiply_quaternions(se3.rotation_exp(t * axis), start.orientation))
         for w, t in zip(way, turn, strict=True)
     ]
     filtered = run(OneEuro(SETTINGS), times, poses)
@@ -178,7 +178,10 @@ class Walk:
 
 def displaced(pose, way):
     """A pose displaced (6,) as a measurement's covariance means it."""
-    return Pose(pose.position + way[:3], se3.product(se3.rotation_exp(way[3:]), pose.orientation))
+    return Pose(
+        pose.position + way[:3],
+        se3.multiply_quaternions(se3.rotation_exp(way[3:]), pose.orientation),
+    )
 
 
 def difference(pose, other):
@@ -198,7 +201,7 @@ def test_it_errs_as_much_as_it_says():
         for _ in range(steps):
             walk.go(int(rng.integers(3_000_000, 50_000_000)))
             seen = walk.measured()
-            place, covariance = kalman.predicted(seen.stamp)
+            place, covariance = kalman.predict_pose(seen.stamp)
             innovation = difference(Pose(*place), seen.pose)
             covariance = covariance[:6, :6] + seen.covariance
             innovations += innovation @ np.linalg.solve(covariance, innovation)
@@ -224,7 +227,7 @@ def test_errors_go_on_as_the_predicted_pose_says_by_differences():
         poses = displaced(start, error[:6]), displaced(displaced(start, way), error[6:])
         for stamp, pose, covariance in zip(stamps, poses, covariances, strict=False):
             kalman.update(Measurement(stamp, pose, covariance))
-        return kalman, *(Pose(*kalman.predicted(stamp)[0]) for stamp in stamps[1:])
+        return kalman, *(Pose(*kalman.predict_pose(stamp)[0]) for stamp in stamps[1:])
 
     now, later = np.zeros((12, 12)), np.zeros((6, 12))
     for k, error in enumerate(step * np.eye(12)):
@@ -235,8 +238,8 @@ def test_errors_go_on_as_the_predicted_pose_says_by_differences():
     kalman = measured(np.zeros(12))[0]
     transition = np.eye(12)
     transition[:6] = later @ np.linalg.inv(now)
-    expected = transition @ kalman.predicted(stamps[1])[1] @ transition.T
-    np.testing.assert_allclose(kalman.predicted(stamps[3])[1], expected, atol=1e-9)
+    expected = transition @ kalman.predict_pose(stamps[1])[1] @ transition.T
+    np.testing.assert_allclose(kalman.predict_pose(stamps[3])[1], expected, atol=1e-9)
 
 
 def test_not_behind_a_uniform_motion():

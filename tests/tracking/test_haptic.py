@@ -48,7 +48,7 @@ def wrench_at(model, pose):
 def moved(start, twist):
     return Pose(
         start.position + twist[:3],
-        se3.product(se3.rotation_exp(twist[3:]), start.orientation),
+        se3.multiply_quaternions(se3.rotation_exp(twist[3:]), start.orientation),
     )
 
 
@@ -76,13 +76,13 @@ def test_at_its_pose_it_is_the_wrench_and_near_it_falls_by_the_stiffness(seed):
     along = np.concatenate([model.push, np.zeros(3)])
     stiff = model.stiffness + 2e3 * np.outer(along, along)  # so that the push ends within 30 mm
     model = dataclasses.replace(model, stiffness=stiff)
-    energy, wrench = model.answer(np.zeros(6))
+    energy, wrench = model.compute_wrench(np.zeros(6))
     np.testing.assert_allclose(wrench, model.wrench, atol=1e-12)
     assert energy >= 0.0
     step = 1e-9 * random.normal(size=6)
     expected = -stiff @ step
     expected[3:] += 0.5 * np.cross(step[3:], wrench[3:])  # a torque's axes turn half as far
-    change = (model.answer(step)[1] - model.answer(-step)[1]) / 2
+    change = (model.compute_wrench(step)[1] - model.compute_wrench(-step)[1]) / 2
     np.testing.assert_allclose(change, expected, atol=1e-11)
 
 
@@ -132,7 +132,7 @@ def pose(random, way=0.1):
 def test_the_probe_goes_as_far_as_the_scale_says_and_turns_as_the_handle():
     arm = HapticDevice(HapticSettings(scale=0.5))
     turn = se3.rotation_exp(np.array([0.0, 0.0, 0.3]))
-    body = arm.take(Pose([0.02, 0.0, -0.04], turn), 7)
+    body = arm.measure_body(Pose([0.02, 0.0, -0.04], turn), 7)
     assert body.stamp == 7
     np.testing.assert_allclose(body.pose.position, [0.01, 0.0, -0.02], atol=1e-15)
     np.testing.assert_allclose(body.pose.orientation, turn, atol=1e-15)
@@ -144,22 +144,22 @@ def test_the_clutch_never_moves_the_probe(seed):
     random = np.random.default_rng(seed)
     arm = HapticDevice(HapticSettings(scale=float(random.uniform(0.1, 5.0))))
     for _ in range(3):
-        before = arm.take(pose(random), 0).pose
-        arm.clutch(True)
-        held = arm.take(pose(random), 1).pose
+        before = arm.measure_body(pose(random), 0).pose
+        arm.set_clutch(True)
+        held = arm.measure_body(pose(random), 1).pose
         np.testing.assert_allclose(held.matrix, before.matrix, atol=1e-12)
         last = pose(random)
-        arm.take(last, 2)
-        arm.clutch(False)
-        np.testing.assert_allclose(arm.take(last, 3).pose.matrix, before.matrix, atol=1e-12)
+        arm.measure_body(last, 2)
+        arm.set_clutch(False)
+        np.testing.assert_allclose(arm.measure_body(last, 3).pose.matrix, before.matrix, atol=1e-12)
     # From there a way and a turn of the handle are the probe's, about the same axes.
     twist = 0.01 * random.normal(size=6)
-    after = arm.take(moved(last, twist), 4).pose
+    after = arm.measure_body(moved(last, twist), 4).pose
     np.testing.assert_allclose(
         se3.rotation_between(before.orientation, after.orientation), twist[3:], atol=1e-12
     )
     arm.reset()
-    body = arm.take(last, 5).pose
+    body = arm.measure_body(last, 5).pose
     np.testing.assert_allclose(body.orientation, last.orientation, atol=1e-15)
 
 
@@ -170,16 +170,16 @@ def test_the_probe_moves_as_the_trackers_frames_say(seed):
     random = np.random.default_rng(seed)
     registration, calibration = pose(random), pose(random)
     arm = HapticDevice(HapticSettings(scale=2.5), registration, calibration)
-    arm.take(pose(random), 0)
-    arm.clutch(True)
-    arm.take(pose(random), 1)
-    arm.clutch(False)
+    arm.measure_body(pose(random), 0)
+    arm.set_clutch(True)
+    arm.measure_body(pose(random), 1)
+    arm.set_clutch(False)
     first, second = pose(random), pose(random)
-    before = registration @ arm.take(first, 2).pose @ calibration
-    after = registration @ arm.take(second, 3).pose @ calibration
-    motion = arm.probe_moved(before, first, second)
+    before = registration @ arm.measure_body(first, 2).pose @ calibration
+    after = registration @ arm.measure_body(second, 3).pose @ calibration
+    motion = arm.compute_probe_motion(before, first, second)
     np.testing.assert_allclose(motion[:3], after.position - before.position, atol=1e-12)
-    turned = se3.product(se3.rotation_exp(motion[3:]), before.orientation)
+    turned = se3.multiply_quaternions(se3.rotation_exp(motion[3:]), before.orientation)
     np.testing.assert_allclose(Pose(orientation=turned).rotation, after.rotation, atol=1e-12)
 
 
@@ -189,9 +189,9 @@ def test_work_at_the_handle_is_work_at_the_probe(seed):
     random = np.random.default_rng(seed)
     arm = HapticDevice(HapticSettings(scale=3.0, force_scale=0.7), pose(random), pose(random))
     handle, probe, wrench = pose(random), pose(random), random.normal(size=6)
-    felt = arm.on_handle(probe, np.zeros(3), wrench)
+    felt = arm.compute_handle_wrench(probe, np.zeros(3), wrench)
     step = 1e-7 * random.normal(size=6)
-    motion = arm.probe_moved(probe, handle, moved(handle, step))
+    motion = arm.compute_probe_motion(probe, handle, moved(handle, step))
     assert felt @ step == pytest.approx(0.7 / 3.0 * (wrench @ motion), rel=1e-5)
 
 
@@ -219,7 +219,7 @@ class Tissue:
         deformation = self._solver.deform(pose)
         turn = pose.rotation
         wrench = np.concatenate([turn @ deformation.force, turn @ deformation.torque])
-        stiffness = self._solver.contact_stiffness()
+        stiffness = self._solver.compute_contact_stiffness()
         if stiffness is None:
             stiffness = np.zeros((6, 6))
         return ContactModel(stamp, pose, wrench, stiffness)
@@ -259,16 +259,16 @@ class Bench:
             self.largest = max(self.largest, -self.given)
         self.last = pose
         if poses:
-            self.rendering.pose(stamp, pose, now)
+            self.rendering.update_pose(stamp, pose, now)
         if models and self.tick >= self.free:
             registration, calibration = self._frames
-            probe = registration @ self.arm.take(pose, stamp).pose @ calibration
+            probe = registration @ self.arm.measure_body(pose, stamp).pose @ calibration
             lag = int(self._random.integers(*self._delay))
             self.answers.append((self.tick + lag, self._world.model(stamp, probe)))
             self.free = self.tick + lag
         while self.answers and self.answers[0][0] <= self.tick:
             self.known = self.answers.pop(0)[1]
-            self.rendering.model(self.known, now)
+            self.rendering.update_model(self.known, now)
         self.tick += 1
         self.felt = self.rendering.render(now)
         return self.felt
@@ -435,7 +435,11 @@ def in_the_wall(x=0.0, turn=0.0):
         ([in_the_wall()] * 340, {"models": False}, "no model"),
         ([in_the_wall(1e-3 * k) for k in range(22)], {"models": False}, "mm from"),
         ([in_the_wall(turn=0.1 * k) for k in range(7)], {"models": False}, "° from"),
-        ([in_the_wall()], {"first": lambda b: b.rendering.distrust("not finite")}, "not finite"),
+        (
+            [in_the_wall()],
+            {"first": lambda b: b.rendering.stop_rendering("not finite")},
+            "not finite",
+        ),
         ([in_the_wall()], {"first": lambda b: b.rendering.clutch(True)}, "the clutch is held"),
         ([in_the_wall()], {"first": lambda b: setattr(b, "tick", b.tick - 3000)}, "jumped back"),
     ],
@@ -449,12 +453,12 @@ def test_at_any_doubt_nothing_is_felt_and_then_again(poses, how, sentence):
     assert sentence in bench.rendering.stopped
     assert not bench.felt.any()
     assert bench.rendering.stops == 1
-    bench.rendering.clutch(False)
+    bench.rendering.set_clutch(False)
     bench.answers.clear()
     bench.free = bench.tick
     last, back = bench.last, Pose([0.0, 0.0, 0.005])
     for part in np.linspace(0.0, 1.0, 40):
-        bench.move(se3.interpolate(last, back, part), models=part == 1.0)
+        bench.move(se3.interpolate_poses(last, back, part), models=part == 1.0)
     felt = press(bench, 0.004, start=0.005)
     assert felt[2] == pytest.approx(-COUPLING * 0.004)
     assert bench.rendering.stops == 1
@@ -465,7 +469,7 @@ def test_a_model_of_before_a_doubt_is_not_believed():
     press(bench, 0.005)
     bench.free = bench.tick
     bench.move(Pose([0.0, 0.0, 0.005]))  # asks; the answer comes 30 ms later
-    bench.rendering.distrust("something was wrong")
+    bench.rendering.stop_rendering("something was wrong")
     felt = [bench.move(Pose([0.0, 0.0, 0.005])).any() for _ in range(100)]
     assert not any(felt[:45])  # that answer is not taken, but the next
     assert all(felt[-20:])

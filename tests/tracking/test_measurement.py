@@ -63,7 +63,7 @@ def test_states_follow_the_table():
     for number, (ms, event, expected) in enumerate(TABLE):
         now = ms * 1_000_000
         if event == "pose":
-            tracking.take(Measurement(number, Pose()), now)
+            tracking.process_measurement(Measurement(number, Pose()), now)
         elif event == "reset":
             tracking.reset()
-        assert tracking.state(now) is expected, f"at {ms} ms"
+        assert tracking.find_state(now) is expected, f"at {ms} ms"

@@ -64,21 +64,21 @@ def test_a_tilted_probe_moves_along_its_own_axes_or_the_patients(frame, expected
 
 def test_a_long_gap_is_not_travelled():
     device = mouse()
-    device.axes(axes(x=1.0), (), 0)
-    device.axes(axes(x=1.0), (), 100 * MS)
-    probe = device.axes(axes(x=1.0), (), 5000 * MS)
+    device.move_probe(axes(x=1.0), (), 0)
+    device.move_probe(axes(x=1.0), (), 100 * MS)
+    probe = device.move_probe(axes(x=1.0), (), 5000 * MS)
     assert probe.pose.position[0] == pytest.approx(0.01)
-    probe = device.axes(axes(x=1.0), (), 1000 * MS)  # the clock was set back
+    probe = device.move_probe(axes(x=1.0), (), 1000 * MS)  # the clock was set back
     assert probe.pose.position[0] == pytest.approx(0.01)
-    assert device.axes(axes(x=1.0), (), 1050 * MS).pose.position[0] == pytest.approx(0.015)
+    assert device.move_probe(axes(x=1.0), (), 1050 * MS).pose.position[0] == pytest.approx(0.015)
 
 
 @given(st.floats(-1.0, 1.0), st.floats(0.0, 0.9))
 @settings(max_examples=40, deadline=None)
 def test_the_dead_band_has_no_step_at_its_edge_and_full_deflection_stays_full(deflection, band):
     device = mouse(dead_band=band)
-    device.axes(axes(x=deflection), (), 0)
-    place = device.axes(axes(x=deflection), (), 100 * MS).pose.position[0] / 0.01
+    device.move_probe(axes(x=deflection), (), 0)
+    place = device.move_probe(axes(x=deflection), (), 100 * MS).pose.position[0] / 0.01
     expected = math.copysign(max(abs(deflection) - band, 0) / (1 - band), deflection)
     assert place == pytest.approx(expected, abs=1e-12)
 
@@ -97,7 +97,7 @@ def test_the_clutch_stops_the_probe():
 def test_the_reset_button_brings_the_probe_home():
     device = mouse(reset_button=2, home=(0.01, 0.0, -0.02))
     drive(device, axes(x=1.0, rx=1.0), 0.5)
-    probe = device.axes(axes(x=1.0), [0, 0, 1], 510 * MS)
+    probe = device.move_probe(axes(x=1.0), [0, 0, 1], 510 * MS)
     np.testing.assert_array_equal(probe.pose.position, [0.01, 0.0, -0.02])
     np.testing.assert_array_equal(probe.pose.orientation, [0, 0, 0, 1])
 
@@ -106,8 +106,8 @@ def test_the_probe_stops_at_the_workspace_and_comes_back_at_once():
     device = mouse(workspace_low=(-0.02, -0.02, -0.02), workspace_high=(0.02, 0.02, 0.02))
     probe = drive(device, axes(x=1.0, y=-0.1), 1.0)
     np.testing.assert_allclose(probe.pose.position, [0.02, -0.01, 0.0], atol=1e-12)
-    device.axes(axes(x=-1.0), (), 1010 * MS)
-    probe = device.axes(axes(x=-1.0), (), 1020 * MS)
+    device.move_probe(axes(x=-1.0), (), 1010 * MS)
+    probe = device.move_probe(axes(x=-1.0), (), 1020 * MS)
     assert probe.pose.position[0] == pytest.approx(0.02 - 0.001)
 
 
@@ -122,9 +122,9 @@ def test_the_probe_stops_at_the_workspace_and_comes_back_at_once():
 def test_a_message_that_cannot_be_used_changes_nothing(bad, word):
     device = mouse()
     drive(device, axes(x=1.0), 0.5)
-    assert device.axes(bad, [1], 505 * MS) is None
+    assert device.move_probe(bad, [1], 505 * MS) is None
     assert word in device.last_problem
-    probe = device.axes(axes(x=1.0), (), 510 * MS)
+    probe = device.move_probe(axes(x=1.0), (), 510 * MS)
     assert probe.pose.position[0] == pytest.approx(0.051)
 
 

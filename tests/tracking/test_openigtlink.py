@@ -18,10 +18,10 @@ from us_sim.tracking.openigtlink import (
     HEADER,
     OpenIGTLinkClient,
     OpenIGTLinkServer,
-    header_of,
-    image_message,
-    poses_in,
-    transform_message,
+    pack_image,
+    pack_transform,
+    parse_header,
+    parse_poses,
 )
 from us_sim.tracking.settings import OpenIGTLinkSettings
 
@@ -217,9 +217,9 @@ def test_an_equal_stamp_and_an_equal_matrix_are_a_repeat(listen, plain, clock):
     version=st.sampled_from([1, 2, 3]),
 )
 def test_any_body_is_poses_or_a_sentence(data, kind, version):
-    header = header_of(message(kind, data, version=version)[: HEADER.size])
+    header = parse_header(message(kind, data, version=version)[: HEADER.size])
     try:
-        poses = poses_in(header, data)
+        poses = parse_poses(header, data)
     except TrackingError:
         return
     assert all(matrix.shape == (4, 4) for _, matrix in poses)
@@ -252,7 +252,7 @@ def test_tracking_data_are_asked_for(listen, plain):
     data = b""
     while len(data) < HEADER.size + 36:
         data += connection.recv(1000)
-    header = header_of(data[: HEADER.size])
+    header = parse_header(data[: HEADER.size])
     assert (header.kind, header.size) == ("STT_TDATA", 36)
     assert struct.unpack(">I", data[HEADER.size : HEADER.size + 4]) == (10,)
 
@@ -261,8 +261,8 @@ def test_what_we_send_is_what_pyigtl_reads_and_its_checksum_holds():
     pixels = np.arange(12, dtype=np.uint8).reshape(3, 4)
     place = np.array([[0, 2e-4, 0, 0.01], [0, 0, 1e-3, 0.02], [1e-4, 0, 0, 0.03], [0, 0, 0, 1]])
     for data in (
-        image_message("Image_Reference", STAMP, pixels, place, "lps"),
-        transform_message("ProbeToReference", STAMP, np.diag([1.0, 1, 1, 1])),
+        pack_image("Image_Reference", STAMP, pixels, place, "lps"),
+        pack_transform("ProbeToReference", STAMP, np.diag([1.0, 1, 1, 1])),
     ):
         head, body = data[: HEADER.size], data[HEADER.size :]
         assert CRC64(body) == HEADER.unpack(head)[-1]
@@ -281,11 +281,11 @@ def test_pyigtls_client_receives_the_newest_from_our_server():
     server = OpenIGTLinkServer("127.0.0.1", 0)
     client = pyigtl.OpenIGTLinkClient("127.0.0.1", server.port)
     try:
-        wait_until(lambda: server.clients == 1)
+        wait_until(lambda: server.client_count == 1)
         for number in range(50):
             matrix = np.eye(4)
             matrix[0, 3] = number * 1e-3
-            server.send("A", transform_message("A", STAMP, matrix))
+            server.send_message("A", pack_transform("A", STAMP, matrix))
         received = []
 
         def newest_came():
@@ -295,20 +295,20 @@ def test_pyigtls_client_receives_the_newest_from_our_server():
         wait_until(newest_came)
     finally:
         client.stop()
-    wait_until(lambda: server.clients == 0)
+    wait_until(lambda: server.client_count == 0)
     server.close()
 
 
 def test_a_client_that_does_not_read_holds_nobody_up():
     server = OpenIGTLinkServer("127.0.0.1", 0)
-    image = image_message("I", STAMP, np.zeros((1000, 1000), np.uint8), np.eye(4), "ras")
+    image = pack_image("I", STAMP, np.zeros((1000, 1000), np.uint8), np.eye(4), "ras")
     with socket.create_connection(("127.0.0.1", server.port)):
         reader = pyigtl.OpenIGTLinkClient("127.0.0.1", server.port)
-        wait_until(lambda: server.clients == 2)
+        wait_until(lambda: server.client_count == 2)
         try:
             for number in range(30):
-                server.send("I", image)
-                server.send("N", transform_message(f"N{number}", STAMP, np.eye(4)))
+                server.send_message("I", image)
+                server.send_message("N", pack_transform(f"N{number}", STAMP, np.eye(4)))
             wait_until(lambda: any(m.device_name == "N29" for m in reader.get_latest_messages()))
         finally:
             reader.stop()

@@ -28,7 +28,7 @@ def seen(ms, x, turn=0.0, covariance=None):
 
 
 def verdicts(gate, *measurements):
-    return [gate.judge(measurement) for measurement in measurements]
+    return [gate.judge_measurement(measurement) for measurement in measurements]
 
 
 @pytest.mark.parametrize(
@@ -47,8 +47,8 @@ def verdicts(gate, *measurements):
 )
 def test_limits_on_speed(ms, x, turn, believed):
     gate = OutlierGate(LIMITS)
-    assert gate.judge(seen(0, 0.0)) is BELIEVED
-    assert gate.judge(seen(ms, x, turn)) is (BELIEVED if believed else REFUSED)
+    assert gate.judge_measurement(seen(0, 0.0)) is BELIEVED
+    assert gate.judge_measurement(seen(ms, x, turn)) is (BELIEVED if believed else REFUSED)
     assert bool(gate.reason) is not believed
 
 
@@ -62,7 +62,7 @@ def test_refused_poses_that_agree_are_the_new_place():
     gate = settled()
     moved = verdicts(gate, *(seen(10 * k, 0.5 + 0.001 * k) for k in range(1, 7)))
     assert moved == [REFUSED, REFUSED, REFUSED, NEW_PLACE, BELIEVED, BELIEVED]
-    assert gate.judge(seen(70, 0.0)) is REFUSED
+    assert gate.judge_measurement(seen(70, 0.0)) is REFUSED
 
 
 def test_refused_poses_that_do_not_agree_are_no_place():
@@ -76,7 +76,7 @@ def test_refused_poses_that_do_not_agree_are_no_place():
 def test_after_refused_poses_the_probe_is_believed_where_it_can_have_come_to():
     gate = settled()
     assert verdicts(gate, seen(10, 5.0), seen(20, -5.0)) == [REFUSED] * 2
-    assert gate.judge(seen(30, 0.0319)) is BELIEVED  # 1 m/s · 30 ms + 2 mm
+    assert gate.judge_measurement(seen(30, 0.0319)) is BELIEVED  # 1 m/s · 30 ms + 2 mm
 
 
 def test_a_first_pose_that_is_wrong_is_outvoted_by_two():
@@ -91,7 +91,7 @@ def test_no_past_locks_a_steady_probe_out(past, place):
     gate, time = OutlierGate(LIMITS), 0
     for step, x in past:
         time += step
-        gate.judge(seen(time, x))
+        gate.judge_measurement(seen(time, x))
     answers = verdicts(gate, *(seen(time + 10 * k, place) for k in range(1, 6)))
     assert answers[-1] is BELIEVED
 
@@ -107,16 +107,16 @@ def test_with_covariances_the_limit_is_chi_squares(part, verdict):
     way = part * math.sqrt(chi2.isf(1e-6, 6)) * deviation
     covariance = np.diag([deviation**2 / 2] * 6)
     gate = OutlierGate(LIMITS)
-    gate.judge(Measurement(0, Pose(), covariance))
-    assert gate.judge(Measurement(1, Pose([0, way, 0]), covariance)) is verdict
+    gate.judge_measurement(Measurement(0, Pose(), covariance))
+    assert gate.judge_measurement(Measurement(1, Pose([0, way, 0]), covariance)) is verdict
 
 
 def test_with_covariances_the_fastest_motion_is_at_the_limit():
     sure = np.diag([1e-14] * 6)
     for part, verdict in ((0.999, BELIEVED), (1.001, REFUSED)):
         gate = OutlierGate(LIMITS)
-        gate.judge(seen(0, 0.0, covariance=sure))
-        assert gate.judge(seen(100, 0.1 * part, 1.0 * part, covariance=sure)) is verdict
+        gate.judge_measurement(seen(0, 0.0, covariance=sure))
+        assert gate.judge_measurement(seen(100, 0.1 * part, 1.0 * part, covariance=sure)) is verdict
     assert re.search(r"100\.1 mm .*57\.4° .*6\.2.* 6\.2", gate.reason)
 
 

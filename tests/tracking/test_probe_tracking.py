@@ -42,7 +42,7 @@ twists = st.tuples(*[numbers] * 6).map(np.array)
 def test_the_probe_is_where_registration_body_and_calibration_put_it(a, b, c):
     registration, body, calibration = se3.exp(a), se3.exp(b), se3.exp(c)
     tracked = ProbeTracking(registration, calibration, create_filter("none"))
-    probe = tracked.take(Measurement(START, body), START)
+    probe = tracked.process_measurement(Measurement(START, body), START)
     expected = registration.matrix @ body.matrix @ calibration.matrix
     np.testing.assert_allclose(probe.pose.matrix, expected, atol=1e-12)
 
@@ -58,7 +58,7 @@ def test_the_covariance_is_that_of_the_probe_in_patient():
     )
     covariance = root @ root.T
     tracked = ProbeTracking(registration, calibration, create_filter("none"))
-    told = tracked.take(Measurement(START, body, covariance, error=0.4), START)
+    told = tracked.process_measurement(Measurement(START, body, covariance, error=0.4), START)
     slopes = np.empty((6, 6))
     step = 1e-6
     for k, way in enumerate(step * np.eye(6)):
@@ -66,7 +66,7 @@ def test_the_covariance_is_that_of_the_probe_in_patient():
             registration
             @ Pose(
                 body.position + s * way[:3],
-                se3.product(se3.rotation_exp(s * way[3:]), body.orientation),
+                se3.multiply_quaternions(se3.rotation_exp(s * way[3:]), body.orientation),
             )
             @ calibration
             for s in (1, -1)
@@ -80,9 +80,9 @@ def test_the_covariance_is_that_of_the_probe_in_patient():
 
 def test_the_time_offset_is_added_to_the_stamp_and_to_nothing_else():
     tracked = tracking(time_offset=-0.0125)
-    probe = tracked.take(at(0), START + 3 * MS)
+    probe = tracked.process_measurement(at(0), START + 3 * MS)
     assert probe.stamp == START - 12_500_000
-    assert tracked.state(START + 302 * MS) is TrackingState.TRACKED
+    assert tracked.find_state(START + 302 * MS) is TrackingState.TRACKED
 
 
 @settings(max_examples=60, deadline=None)
@@ -94,7 +94,7 @@ def test_no_pose_is_published_but_under_its_own_stamp(steps, method):
     tracked, stamp, newest = tracking(method, GateSettings(), time_offset=0.5), START * 10, None
     for step, x in steps:
         stamp += step * MS
-        probe = tracked.take(Measurement(stamp, Pose([x, 0.0, 0.0])), stamp)
+        probe = tracked.process_measurement(Measurement(stamp, Pose([x, 0.0, 0.0])), stamp)
         late = newest is not None and -1000 * MS < stamp - newest <= 0
         if late:
             assert probe is None
@@ -127,11 +127,11 @@ def test_stamps_that_jump_back_start_everything_anew(method):
 def test_after_it_was_lost_it_starts_where_it_is_found(method):
     tracked = tracking(method, GateSettings(), lost_after=0.5)
     take(tracked, *(at(10 * k, 0.001 * k) for k in range(50)))
-    assert tracked.state(at(490 + 499).stamp) is TrackingState.COASTING
-    assert tracked.state(at(490 + 500).stamp) is TrackingState.LOST
+    assert tracked.find_state(at(490 + 499).stamp) is TrackingState.COASTING
+    assert tracked.find_state(at(490 + 500).stamp) is TrackingState.LOST
     found = at(1000, 3.0)
     assert take(tracked, found)[0].pose.position[0] == 3.0
-    assert tracked.state(found.stamp) is TrackingState.TRACKED
+    assert tracked.find_state(found.stamp) is TrackingState.TRACKED
     assert tracked.restarts == {"gap": 1}
 
 
@@ -155,7 +155,7 @@ def test_while_all_is_refused_it_coasts():
     for k in range(10, 60):
         there = at(10 * k, 5.0 + k)
         assert take(tracked, there) == [None]
-        states.append(tracked.state(there.stamp))
+        states.append(tracked.find_state(there.stamp))
     assert states[28] is TrackingState.TRACKED
     assert states[29] is TrackingState.COASTING  # 0.3 s after the last that was believed
 
@@ -166,7 +166,7 @@ def test_nonsense_is_not_believed_when_the_probe_is_lost_either():
     take(tracked, *(at(20 * k) for k in range(10)))
     nonsense = take(tracked, *(at(200 + 20 * k, x) for k, x in enumerate(rng.permutation(200) + 1)))
     assert nonsense == [None] * 200
-    assert tracked.state(at(4200).stamp) is TrackingState.LOST
+    assert tracked.find_state(at(4200).stamp) is TrackingState.LOST
     answers = take(tracked, *(at(4200 + 20 * k, 0.3) for k in range(6)))
     assert [answer is None for answer in answers] == [True] * 4 + [False] * 2
     assert answers[4].pose.position[0] == 0.3
@@ -207,7 +207,7 @@ def test_outliers_of_a_real_tracker_are_refused_and_counted(recorded, method, na
     for time, matrix in zip(times, matrices[name], strict=True):
         pose = Pose(1e-3 * matrix[:3, 3], Pose.from_matrix(matrix).orientation)
         stamp = round(1e9 * time)
-        answers.append(tracked.take(Measurement(stamp, pose), stamp))
+        answers.append(tracked.process_measurement(Measurement(stamp, pose), stamp))
     assert [k for k, answer in enumerate(answers) if answer is None] == refused
     assert tracked.refused == {"gate": len(refused)}
     assert tracked.restarts == ({"place": 1} if name == "Stylus" else {})

@@ -22,10 +22,10 @@ def forces_on_tissue(stiffness, delay, damping, wanted=4.0, seconds=20.0):
     start = robot.pose.position[2]  # the spring begins where the arm is
     for step in range(round(seconds * RATE)):
         time = step / RATE
-        robot.feel(time, forces[-1 - late])
-        robot.ask_force(time, wanted)
+        robot.update_force(time, forces[-1 - late])
+        robot.request_force(time, wanted)
         # Pulled, too: the bound is of a linear spring.
-        forces.append(stiffness * (robot.move(time).position[2] - start))
+        forces.append(stiffness * (robot.move_until(time).position[2] - start))
     return np.array(forces)
 
 
@@ -53,9 +53,9 @@ def test_the_defaults_press_stiff_tissue_without_overshoot_four_frames_late():
     robot, forces = Robot(settings), [0.0] * (late + 1)
     for step in range(600):
         time = step / settings.rate
-        robot.feel(time, forces[-1 - late])
-        robot.ask_force(time, 20.0)
-        forces.append(stiffness * max(robot.move(time).position[2], 0.0))
+        robot.update_force(time, forces[-1 - late])
+        robot.request_force(time, 20.0)
+        forces.append(stiffness * max(robot.move_until(time).position[2], 0.0))
     assert max(forces) <= 20.0 + 0.01
     assert forces[-60:] == pytest.approx([20.0] * 60, abs=0.01)
 
@@ -67,11 +67,11 @@ twists = st.lists(st.floats(-5.0, 5.0), min_size=6, max_size=6).map(np.array)
 def test_no_command_takes_the_arm_beyond_its_limits(commands):
     settings = RobotSettings()
     robot = Robot(settings)
-    time, before, velocity = 0.0, robot.move(0.0), np.zeros(6)
+    time, before, velocity = 0.0, robot.move_until(0.0), np.zeros(6)
     for twist, passed in commands:
-        robot.ask_velocity(time, twist)
+        robot.request_velocity(time, twist)
         time += passed
-        pose = robot.move(time)
+        pose = robot.move_until(time)
         x, y, z = pose.position
         assert max(abs(x), abs(y)) <= settings.aside
         assert -settings.lift <= z <= settings.press
@@ -93,8 +93,8 @@ def test_the_arm_speeds_up_slowly_and_stops_when_nothing_is_asked_any_more():
     for step in range(200):
         time = step / 100
         if time < 1.0:
-            robot.ask_velocity(time, twist)
-        places.append(robot.move(time).position[0])
+            robot.request_velocity(time, twist)
+        places.append(robot.move_until(time).position[0])
     speeds = np.diff(places) * 100
     assert speeds.max() == pytest.approx(0.02)
     assert np.abs(np.diff(speeds)).max() <= 0.1 / 100 + 1e-9
@@ -106,10 +106,10 @@ def test_the_arm_speeds_up_slowly_and_stops_when_nothing_is_asked_any_more():
 def test_a_velocity_along_the_patients_axes_is_one_however_the_probe_is_turned():
     robot = Robot(RobotSettings(acceleration=1000.0, angular_acceleration=1e4))
     for step in range(3):
-        robot.ask_velocity(0.1 * step, np.array([0, 0, 0, 0.2, 0.4, 0.3]))
-        before = robot.move(0.1 * step)
-    robot.ask_velocity(0.2, np.array([0.02, 0.01, 0, 0, 0, 0]), in_patient=True)
-    after = robot.move(0.3)
+        robot.request_velocity(0.1 * step, np.array([0, 0, 0, 0.2, 0.4, 0.3]))
+        before = robot.move_until(0.1 * step)
+    robot.request_velocity(0.2, np.array([0.02, 0.01, 0, 0, 0, 0]), in_patient=True)
+    after = robot.move_until(0.3)
     assert np.degrees(2 * math.acos(before.orientation[3])) > 5
     np.testing.assert_allclose(after.position - before.position, [0.002, 0.001, 0], atol=1e-9)
     np.testing.assert_allclose(after.orientation, before.orientation, atol=1e-9)
@@ -117,13 +117,13 @@ def test_a_velocity_along_the_patients_axes_is_one_however_the_probe_is_turned()
 
 def test_a_force_is_not_sought_where_none_is_felt():
     robot = Robot(RobotSettings())
-    robot.ask_force(0.0, 4.0)
-    robot.feel(0.0, 0.0)
-    robot.move(0.0)
-    assert robot.move(0.1).position[2] > -RobotSettings().lift
+    robot.request_force(0.0, 4.0)
+    robot.update_force(0.0, 0.0)
+    robot.move_until(0.0)
+    assert robot.move_until(0.1).position[2] > -RobotSettings().lift
     assert robot.action == "seeking 4.0 N"
-    robot.ask_force(1.0, 4.0)
+    robot.request_force(1.0, 4.0)
     for step in range(30):
-        robot.move(1.0 + step / 100)
+        robot.move_until(1.0 + step / 100)
     assert robot.action == "without a felt force"
-    assert robot.move(1.3).position[2] == robot.move(1.31).position[2]
+    assert robot.move_until(1.3).position[2] == robot.move_until(1.31).position[2]

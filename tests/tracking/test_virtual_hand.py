@@ -21,22 +21,22 @@ from us_sim.tracking.virtual_hand import (
     DEEPEST,
     STEEPEST,
     Approach,
-    Motion,
-    RestSurface,
     Stance,
+    StanceMotion,
+    StandingSurface,
 )
 
 RADIUS = 0.045
 
 
-def cylinder() -> RestSurface:
+def cylinder() -> StandingSurface:
     """Half a cylinder about the line x = 0, z = RADIUS, along y; facets of 2 degrees."""
     size = (math.pi * RADIUS, 0.1)
     sheet = bent_surface(size, math.radians(2) * RADIUS, flat_width=0.0, radius=RADIUS)
-    return RestSurface(sheet.vertices, sheet.triangles)
+    return StandingSurface(sheet.vertices, sheet.triangles)
 
 
-def sphere(steps: int = 90) -> RestSurface:
+def sphere(steps: int = 90) -> StandingSurface:
     """About the origin, by latitude and longitude."""
     polar, turn = np.linspace(0, math.pi, steps + 1), np.arange(2 * steps) * math.pi / steps
     grid = np.stack(
@@ -51,17 +51,17 @@ def sphere(steps: int = 90) -> RestSurface:
     a, b = index[:-1], index[1:]
     c, d = np.roll(b, -1, axis=1), np.roll(a, -1, axis=1)
     triangles = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
-    return RestSurface(RADIUS * grid.reshape(-1, 3), triangles)
+    return StandingSurface(RADIUS * grid.reshape(-1, 3), triangles)
 
 
-PLANE, CYLINDER, SPHERE = RestSurface.plane(0.1), cylinder(), sphere()
+PLANE, CYLINDER, SPHERE = StandingSurface.create_plane(0.1), cylinder(), sphere()
 FACET = RADIUS * (1 - math.cos(math.radians(1)))  # how deep a facet of 2 degrees lies below
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
 def test_on_a_plane_the_foot_is_straight_below(x, y, z):
-    foot = PLANE.closest(np.array([x, y, z]))
+    foot = PLANE.find_closest(np.array([x, y, z]))
     np.testing.assert_allclose(foot.point, [x, y, 0.0], atol=1e-15)
     np.testing.assert_allclose(foot.normal, [0.0, 0.0, -1.0])
 
@@ -71,7 +71,7 @@ def test_on_a_plane_the_foot_is_straight_below(x, y, z):
 def test_on_a_cylinder_the_foot_is_on_the_radius(angle, y, height):
     outwards = np.array([math.sin(angle), 0.0, -math.cos(angle)])
     axis = np.array([0.0, y, RADIUS])
-    foot = CYLINDER.closest(axis + (RADIUS + height) * outwards)
+    foot = CYLINDER.find_closest(axis + (RADIUS + height) * outwards)
     np.testing.assert_allclose(foot.normal, outwards, atol=math.radians(1.05))
     # On a facet the closest point is up to the facet's slope times the height beside the radius.
     beside = math.radians(1.05) * abs(height) + FACET
@@ -82,7 +82,7 @@ def test_the_normal_does_not_jump_at_the_edges_of_facets():
     way = np.linspace(-1.2, 1.2, 4001)
     normals = np.array(
         [
-            CYLINDER.closest(
+            CYLINDER.find_closest(
                 np.array([RADIUS * math.sin(a), 0.003, RADIUS - RADIUS * math.cos(a)])
             ).normal
             for a in way[::10]
@@ -95,13 +95,13 @@ def test_the_normal_does_not_jump_at_the_edges_of_facets():
 @settings(max_examples=40, deadline=None)
 @given(st.floats(-0.04, 0.04), st.floats(-0.04, 0.04))
 def test_above_a_place_the_foot_is_straight_below(x, y):
-    foot = CYLINDER.above(x, y)
+    foot = CYLINDER.find_top(x, y)
     np.testing.assert_allclose(foot.point[:2], [x, y], atol=1e-6)
     assert foot.point[2] == pytest.approx(RADIUS - math.sqrt(RADIUS**2 - x**2), abs=2.2 * FACET)
 
 
 def test_a_short_slide_keeps_its_length_and_bends_with_the_skin():
-    slid = at(0.3).slid(CYLINDER, 0.002, -0.004)
+    slid = at(0.3).slide_along(CYLINDER, 0.002, -0.004)
     angle = math.atan2(slid.point[0], RADIUS - slid.point[2])
     assert RADIUS * (angle - 0.3) == pytest.approx(0.002, abs=5e-5)
     assert slid.point[1] == pytest.approx(-0.004, abs=5e-5)
@@ -111,12 +111,12 @@ def test_the_closest_point_is_that_of_all_triangles_tried_one_by_one():
     sheet = plane_surface((0.02, 0.02), 0.002)
     generator = np.random.default_rng(4)
     vertices = sheet.vertices + generator.normal(scale=3e-4, size=sheet.vertices.shape)
-    surface = RestSurface(vertices, sheet.triangles)
+    surface = StandingSurface(vertices, sheet.triangles)
     weights = generator.dirichlet([1, 1, 1], size=400)
     for point in generator.uniform(-0.015, 0.015, size=(20, 3)):
         samples = np.einsum("wc,tcx->twx", weights, vertices[sheet.triangles])
         least = np.linalg.norm(samples - point, axis=2).min()
-        distance = np.linalg.norm(surface.closest(point).point - point)
+        distance = np.linalg.norm(surface.find_closest(point).point - point)
         assert distance <= least + 1e-12
         assert distance == pytest.approx(least, abs=3e-4)
 
@@ -182,10 +182,10 @@ def at(angle: float, **held: float) -> Stance:
 
 
 def test_a_jump_around_the_arm_goes_over_its_skin():
-    motion = Motion(at(-1.0, press=0.003))
-    motion.aim(at(1.0, press=0.003))
+    motion = StanceMotion(at(-1.0, press=0.003))
+    motion.aim_at(at(1.0, press=0.003))
     for _ in range(60):
-        position = motion.advance(1 / 60).pose(CYLINDER).position
+        position = motion.advance(1 / 60).compute_pose(CYLINDER).position
         distance = math.hypot(position[0], position[2] - RADIUS)
         assert distance == pytest.approx(RADIUS - 0.003, abs=2e-5)
     assert motion.is_at_rest
@@ -198,7 +198,7 @@ turns = st.floats(-math.pi, math.pi)
 def test_upright_on_a_cylinder_the_array_stays_across_it():
     angle = math.radians(40)
     point = [RADIUS * math.sin(angle), 0.01, RADIUS * (1 - math.cos(angle))]
-    pose = Stance(point, press=0.004).pose(CYLINDER)
+    pose = Stance(point, press=0.004).compute_pose(CYLINDER)
     across, elevation, inwards = pose.rotation.T
     np.testing.assert_allclose(across, [math.cos(angle), 0, math.sin(angle)], atol=1e-3)
     np.testing.assert_allclose(elevation, [0, 1, 0], atol=1e-3)
@@ -214,7 +214,7 @@ def test_each_angle_turns_about_its_own_axis():
         ("rock", [[c, 0, -s], [0, 1, 0], [s, 0, c]]),
         ("rotation", [[c, s, 0], [-s, c, 0], [0, 0, 1]]),
     ):
-        rotation = Stance(**{name: quarter}).pose(PLANE).rotation
+        rotation = Stance(**{name: quarter}).compute_pose(PLANE).rotation
         np.testing.assert_allclose(rotation.T, axes, atol=1e-12)
 
 
@@ -223,9 +223,9 @@ def test_each_angle_turns_about_its_own_axis():
 def test_the_way_back_from_a_pose(polar, turn, press, rotation, fan, rock):
     outwards = [math.sin(polar) * math.cos(turn), math.sin(polar) * math.sin(turn)]
     point = RADIUS * np.array([*outwards, math.cos(polar)])
-    pose = Stance(point, press, rotation, fan, rock).pose(SPHERE)
-    found = Stance.of(pose, SPHERE)
-    again = found.pose(SPHERE)
+    pose = Stance(point, press, rotation, fan, rock).compute_pose(SPHERE)
+    found = Stance.from_pose(pose, SPHERE)
+    again = found.compute_pose(SPHERE)
     np.testing.assert_allclose(again.position, pose.position, atol=1e-8)
     assert np.abs(rotation_between(again.orientation, pose.orientation)).max() < 1e-6
     assert found.press == pytest.approx(press, abs=1e-5)
@@ -234,7 +234,7 @@ def test_the_way_back_from_a_pose(polar, turn, press, rotation, fan, rock):
 
 
 def test_no_hand_presses_or_turns_without_end():
-    held = Stance(press=1.0, rotation=3.5, fan=-2.0, rock=2.0).within_reach()
+    held = Stance(press=1.0, rotation=3.5, fan=-2.0, rock=2.0).clip_to_reach()
     assert (held.press, held.fan, held.rock) == (DEEPEST, -STEEPEST, STEEPEST)
     assert held.rotation == pytest.approx(3.5 - math.tau)
 

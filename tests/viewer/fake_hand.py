@@ -7,7 +7,7 @@ import numpy as np
 
 from us_sim.skin.surface import plane_surface
 from us_sim.viewer.stream import Feed, Packet, Simulator
-from us_sim.viewer.surfaces import ColouredSurface, RestSurface, transducer_packet
+from us_sim.viewer.surfaces import ColouredSurface, StreamedSurface, make_transducer_packet
 
 PIXEL = 8e-5  # m
 FACE = [0.005, 0.01, 0.001]  # m, where the probe's face is
@@ -22,7 +22,7 @@ class FakeHand:
     def __init__(self, simulator: Simulator) -> None:
         self.asked: list[dict[str, Any]] = []
         self.image, self.state = Feed("image", rate=None), Feed("hand", rate=None)
-        simulator.add(self.image, self.state)
+        simulator.add_feeds(self.image, self.state)
         simulator.commands["hand"] = self._take
         simulator.commands["take"] = self._take_over
         self.takes: list[Any] = []  # pages that were to take the probe
@@ -41,12 +41,12 @@ class FakeHand:
         header |= {"obstacle": "", "warning": ""}
         header["range"] = RANGES
         header |= {"stance": STANCE, "goal": STANCE, **changes}
-        self.state.offer(lambda n: Packet("hand", n, header, b""))
+        self.state.offer_packet(lambda n: Packet("hand", n, header, b""))
 
     def show(self, **told: Any) -> None:
         header = {"stamp": "1", "rows": 320, "columns": 320, "encoding": "mono8"}
         header |= {"matrix": MATRIX, **told}
-        self.image.offer(lambda n: Packet("image", n, header, bytes(320 * 320)))
+        self.image.offer_packet(lambda n: Packet("image", n, header, bytes(320 * 320)))
 
     def total(self, name: str) -> Any:
         """The sum of all changes of a quantity."""
@@ -66,14 +66,14 @@ def show_patient(simulator: Simulator) -> None:
     """Feed a flat piece of skin and a probe that stands on it."""
     skin, mesh, pose = (Feed(kind, rate=None) for kind in ("skin_mesh", "probe_mesh", "probe"))
     sheet = plane_surface((0.16, 0.16), 0.02)
-    surface = RestSurface(sheet.vertices, sheet.triangles)
-    skin.offer(lambda n: surface.told("skin_mesh", n))
+    surface = StreamedSurface(sheet.vertices, sheet.triangles)
+    skin.offer_packet(lambda n: surface.make_rest_packet("skin_mesh", n))
     body = ColouredSurface("body", (0.9, 0.9, 0.9), *_box([-0.02, -0.008, -0.12], [0.02, 0.008, 0]))
     outline = np.array([[-0.02, 0, 0], [0.02, 0, 0], [0.02, 0, 0.04], [-0.02, 0, 0.04]])
-    mesh.offer(lambda n: transducer_packet("probe_mesh", n, [body], outline))
+    mesh.offer_packet(lambda n: make_transducer_packet("probe_mesh", n, [body], outline))
     header = {"stamp": "1", "position": FACE, "quaternion": [0, 0, 0, 1]}
-    pose.offer(lambda n: Packet("probe", n, header, b""))
-    simulator.add(skin, mesh, pose)
+    pose.offer_packet(lambda n: Packet("probe", n, header, b""))
+    simulator.add_feeds(skin, mesh, pose)
 
 
 def _box(lower: list[float], upper: list[float]) -> tuple[Any, Any]:

@@ -19,7 +19,7 @@ class FakeNodes(RemoteParameters):
 
     def tell(self, *parameters: Parameter) -> None:
         """These are the parameters of their node."""
-        node = self.of(parameters[0].node)
+        node = self.get_node(parameters[0].node)
         node.parameters, node.state = {each.name: each for each in parameters}, THERE
 
     @property

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from us_sim.errors import UsSimError
-from us_sim.viewer.access import Access, is_loopback
+from us_sim.viewer.access import AccessControl, is_loopback
 from us_sim.viewer.server import WebServer
 from us_sim.viewer.stream import Simulator
 
@@ -49,7 +49,7 @@ def asked(
 
     # In a thread of its own: in this one a browser of other tests may have its loop.
     answering = threading.Thread(
-        target=lambda: asyncio.run(Access(app or passed, token)(scope, receive, send))
+        target=lambda: asyncio.run(AccessControl(app or passed, token)(scope, receive, send))
     )
     answering.start()
     answering.join()

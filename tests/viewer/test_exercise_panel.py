@@ -13,8 +13,8 @@ from std_msgs.msg import String
 
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.qos import LATCHED
-from us_sim.viewer.score import PICTURE, SCORE, add_score
-from us_sim.viewer.stream import Feed, Packet, Posted, Simulator
+from us_sim.viewer.score import PICTURE, SCORE, connect_scorer
+from us_sim.viewer.stream import CallPoster, Feed, Packet, Simulator
 
 STEPS = (
     {"what": "vein at 9 mm", "state": "done", "seen": "closed at 6.0 N"},
@@ -37,7 +37,7 @@ class Scorer:
     def _take(self, what):
         self.asked.append(what)
         if what == "draw":
-            self.picture.offer(lambda n: Packet(PICTURE, n, {}, PNG))
+            self.picture.offer_packet(lambda n: Packet(PICTURE, n, {}, PNG))
 
     def say(self, steps, feedback="live"):
         header = {"name": "Compression", "description": "Compress the vein.", "scene": "arm"}
@@ -45,7 +45,7 @@ class Scorer:
         is_done = all(step["state"] == "done" for step in header["steps"])
         header |= {"state": "passed" if is_done else "running", "plain": {"Time, s": "12"}}
         header |= {"about": {"begun": "now", "feedback": feedback}}
-        self.score.offer(lambda n: Packet(SCORE, n, header, b""))
+        self.score.offer_packet(lambda n: Packet(SCORE, n, header, b""))
 
 
 def test_task_steps_and_score_are_shown_begun_anew_and_saved(page, simulator):
@@ -119,7 +119,7 @@ def heard(bench: Bench):
     """The simulator that a node fills."""
     node = bench.add(GuardedNode("viewer", context=bench.context))
     simulator = Simulator()
-    add_score(node, Posted(node), simulator)
+    connect_scorer(node, CallPoster(node), simulator)
     return simulator
 
 
@@ -148,7 +148,7 @@ def test_what_the_scorer_says_is_heard_while_a_page_shows_it(bench, heard):
     score, picture = heard.feeds[SCORE], heard.feeds[PICTURE]
     assert not score.sequence
     for feed in (score, picture):
-        feed.watch(lambda: None)
+        feed.add_watcher(lambda: None)
     bench.spin_until(lambda: score.sequence and picture.sequence)
     assert picture.newest().payload == PNG
     told = score.newest().header

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from us_sim.errors import UsSimError
-from us_sim.viewer.export import exported, frames_of
+from us_sim.viewer.export import decode_frames, export_frames
 from us_sim.viewer.stream import Packet
 
 MATRIX = [1e-4, 0, 0, -0.002, 0, 0, 0, 0, 0, 2e-4, 0, 1e-4, 0, 0, 0, 1]
@@ -45,7 +45,7 @@ def images(count: int, **told: Any) -> list[Any]:
 def test_a_loop_plays_as_fast_as_it_came(tmp_path: Path) -> None:
     times = [100.0, 100.1, 100.9, 102.0]
     file = tmp_path / "loop.mp4"
-    file.write_bytes(exported("mp4", pictures(times, [(120, 160)] * 3 + [(131, 160)])))
+    file.write_bytes(export_frames("mp4", pictures(times, [(120, 160)] * 3 + [(131, 160)])))
     film, greys = cv2.VideoCapture(str(file)), []
     while (read := film.read())[0]:
         greys.append(read[1][:100].mean())
@@ -61,7 +61,7 @@ def test_dicom_has_the_pixels_where_they_are_and_says_that_they_are_simulated(
 ) -> None:
     pydicom = pytest.importorskip("pydicom")
     frames = images(count)
-    read = pydicom.dcmread(io.BytesIO(exported("dcm", frames)))
+    read = pydicom.dcmread(io.BytesIO(export_frames("dcm", frames)))
     assert read.SOPClassUID == read.file_meta.MediaStorageSOPClassUID == kind
     np.testing.assert_array_equal(
         read.pixel_array.ravel(), np.frombuffer(b"".join(sent for _, sent in frames), np.uint8)
@@ -86,7 +86,7 @@ def test_dicom_of_a_jpeg_in_colour_is_in_colour_and_says_that_it_lost_something(
     sent = cv2.imencode(".jpg", picture)[1].tobytes()
     ((header, _),) = images(1, encoding="jpeg", kind="annotated")
     header |= {"panels": 2}
-    read = pydicom.dcmread(io.BytesIO(exported("dcm", [(header, sent)])))
+    read = pydicom.dcmread(io.BytesIO(export_frames("dcm", [(header, sent)])))
     assert read.SequenceOfUltrasoundRegions[0].RegionLocationMaxX1 == 19  # of two images
     assert np.abs(read.pixel_array[9, 9].astype(int) - (200, 60, 30)).max() < 6
     assert read.LossyImageCompression == "01"
@@ -95,7 +95,7 @@ def test_dicom_of_a_jpeg_in_colour_is_in_colour_and_says_that_it_lost_something(
 def test_without_pydicom_that_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pydicom.dataset", None)
     with pytest.raises(UsSimError, match=r"us_sim\[dicom\]"):
-        exported("dcm", images(1))
+        export_frames("dcm", images(1))
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_without_pydicom_that_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_what_cannot_be_saved_is_refused(kind: str, frames: list[Any]) -> None:
     with pytest.raises(UsSimError):
-        exported(kind, frames)
+        export_frames(kind, frames)
 
 
 @pytest.mark.parametrize(
@@ -128,10 +128,10 @@ def test_what_cannot_be_saved_is_refused(kind: str, frames: list[Any]) -> None:
 )
 def test_a_message_without_frames_is_refused(message: bytes) -> None:
     with pytest.raises(UsSimError, match="no frames"):
-        frames_of(message)
+        decode_frames(message)
 
 
 def test_frames_come_apart_as_they_were_sent() -> None:
     told = {"frames": [{"bytes": 1, "a": 1}, {"bytes": 3, "a": 2}]}
-    frames = frames_of(Packet("dcm", 0, json.loads(json.dumps(told)), b"wxyz").encoded)
+    frames = decode_frames(Packet("dcm", 0, json.loads(json.dumps(told)), b"wxyz").encoded)
     assert [(header["a"], sent) for header, sent in frames] == [(1, b"w"), (2, b"xyz")]

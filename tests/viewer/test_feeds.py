@@ -18,10 +18,10 @@ from std_msgs.msg import Float64MultiArray, Int32MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from us_sim.geometry.collider import RoundedBox
-from us_sim.geometry.transducer import transducer_mesh
+from us_sim.geometry.transducer import build_transducer_mesh
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import (
-    Shape,
+    MarkerShape,
     affine_message,
     cloud_message,
     image_message,
@@ -34,13 +34,13 @@ from us_sim.nodes.qos import LATCHED
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.viewer.feeds import (
     ProbeFeeds,
-    RestMesh,
+    RestMeshListener,
     SkinFeeds,
     StructuresFeed,
     TissueFeeds,
-    image_feeds,
+    make_image_feeds,
 )
-from us_sim.viewer.stream import Feed, Packet, Posted
+from us_sim.viewer.stream import CallPoster, Feed, Packet
 
 
 class Watcher(GuardedNode):
@@ -49,9 +49,9 @@ class Watcher(GuardedNode):
     def __init__(self, **kwargs):
         super().__init__("watcher", **kwargs)
         self.health = Health(self, "test")
-        self.post = Posted(self)
+        self.post = CallPoster(self)
         self.arranged = False, False
-        feeds = image_feeds(
+        feeds = make_image_feeds(
             self, self.post, 30.0, lambda stamp: {"known": stamp}, lambda: self.arranged
         )
         self.feeds = {feed.kind: feed for feed in feeds}
@@ -74,9 +74,9 @@ def test_watching_on_and_off_at_once_ends_as_it_was_left(bench, watcher):
     publisher = bench.peer.create_publisher(Image, "ultrasound/image", 10)
     feed = watcher.feeds["image"]
     for _ in range(3):
-        feed.watch(nothing)
-        feed.unwatch(nothing)
-    feed.watch(nothing)
+        feed.add_watcher(nothing)
+        feed.remove_watcher(nothing)
+    feed.add_watcher(nothing)
     bench.spin_until(lambda: publisher.get_subscription_count() == 1)
     bench.spin_for(5)
     assert publisher.get_subscription_count() == 1
@@ -92,7 +92,7 @@ def test_watching_on_and_off_at_once_ends_as_it_was_left(bench, watcher):
 def test_pictures_keep_their_colours(bench, watcher, kind, topic):
     feed, picture = watcher.feeds[kind], np.zeros((48, 64, 3), np.uint8)
     picture[:, :32] = 200, 60, 30  # red
-    feed.watch(nothing)
+    feed.add_watcher(nothing)
     publisher = bench.publisher(Image, topic)
     publisher.publish(image_message(picture, Time(), "probe"))
     bench.spin_until(lambda: feed.sequence == 1)
@@ -104,7 +104,7 @@ def test_pictures_keep_their_colours(bench, watcher, kind, topic):
 def test_a_jpeg_of_speckle_is_near_what_it_was(bench, watcher):
     feed = watcher.feeds["image_jpeg"]
     smooth = cv2.GaussianBlur(speckle(256, 256), (0, 0), 2.0)
-    feed.watch(nothing)
+    feed.add_watcher(nothing)
     publisher = bench.publisher(Image, "ultrasound/image")
     publisher.publish(image_message(smooth, Time(), "probe"))
     bench.spin_until(lambda: feed.sequence == 1)
@@ -119,7 +119,7 @@ def test_an_image_says_where_its_pixels_are_and_what_else_is_known(bench, watche
     places = bench.peer.create_publisher(Float64MultiArray, "ultrasound/image_to_probe", LATCHED)
     places.publish(affine_message(matrix))
     feed = watcher.feeds["image"]
-    feed.watch(nothing)
+    feed.add_watcher(nothing)
     publisher = bench.publisher(Image, "ultrasound/image")
 
     pixels = speckle(40, 30)
@@ -155,7 +155,7 @@ def test_what_cannot_be_shown_is_said_and_the_next_is_shown(
     bench, watcher, kind, message, sentence
 ):
     feed = watcher.feeds[kind]
-    feed.watch(nothing)
+    feed.add_watcher(nothing)
     topic = "ultrasound/image_annotated" if kind == "annotated" else "ultrasound/image"
     publisher = bench.publisher(Image, topic)
     odd = image_message(speckle(4, 4), Time(), "probe")
@@ -175,7 +175,7 @@ def test_what_cannot_be_shown_is_said_and_the_next_is_shown(
 
 def test_posted_work_is_done_in_order_and_a_failure_is_said(bench):
     node = GuardedNode("late", context=bench.context)
-    post, done = Posted(node), []
+    post, done = CallPoster(node), []
     post(lambda: 1 // 0)
     for i in range(3):  # before anybody spins the node
         post(lambda i=i: done.append(i))
@@ -191,7 +191,7 @@ def test_of_two_images_beside_each_other_the_left_ones_pixels_are_known(bench, w
     places.publish(affine_message(matrix))
     watcher.arranged = True, True
     feed = watcher.feeds["annotated"]
-    feed.watch(nothing)
+    feed.add_watcher(nothing)
     publisher = bench.publisher(Image, "ultrasound/image_annotated")
 
     def header():
@@ -228,9 +228,9 @@ def graph(bench: Bench) -> SimpleNamespace:
     """A node with all feeds of the scene, by kind, and publishers to it."""
     node = bench.add(GuardedNode("viewer", context=bench.context))
     node.health = Health(node, "test")
-    post = Posted(node)
+    post = CallPoster(node)
     feeds: dict[str, Feed] = {}
-    rest = RestMesh(node)
+    rest = RestMeshListener(node)
     probe = ProbeFeeds(node, post, 30.0)
     for made in (SkinFeeds(node, post, 30.0), probe):
         feeds |= {feed.kind: feed for feed in made.feeds}
@@ -242,7 +242,7 @@ def graph(bench: Bench) -> SimpleNamespace:
         found: list[Packet] = []
 
         def look() -> bool:
-            packet = feeds[kind].newest()
+            packet = feeds[kind].get_newest()
             found[:] = [packet] if packet is not None and when(packet) else []
             return bool(found)
 
@@ -265,10 +265,10 @@ def test_nothing_is_subscribed_to_while_no_page_watches(graph):
     graph.bench.spin_for(5)
     assert not any(graph.bench.peer.count_subscribers(topic) for topic in topics)
     for feed in graph.feeds.values():
-        feed.watch(unused)
+        feed.add_watcher(unused)
     graph.bench.spin_until(lambda: graph.bench.peer.count_subscribers("skin/nodes") == 1)
     for feed in graph.feeds.values():
-        feed.unwatch(unused)
+        feed.remove_watcher(unused)
     graph.bench.spin_until(
         lambda: not any(graph.bench.peer.count_subscribers(topic) for topic in topics)
     )
@@ -277,7 +277,7 @@ def test_nothing_is_subscribed_to_while_no_page_watches(graph):
 def test_the_skin_is_told_once_and_moved_by_steps(graph):
     graph.latch(Mesh, "skin/mesh", mesh_message(SQUARE, TRIANGLES))
     for kind in ("skin_mesh", "skin"):
-        graph.feeds[kind].watch(unused)
+        graph.feeds[kind].add_watcher(unused)
     told = graph.newest("skin_mesh")
     nodes = graph.bench.publisher(PointCloud2, "skin/nodes")
     nodes.publish(cloud(SQUARE + np.array([0, 0, 0.003]), second=7))
@@ -291,7 +291,7 @@ def test_the_skin_is_told_once_and_moved_by_steps(graph):
 def test_skin_that_cannot_be_used_is_said_and_what_was_there_stays(graph):
     graph.latch(Mesh, "skin/mesh", mesh_message(SQUARE, TRIANGLES))
     for kind in ("skin_mesh", "skin"):
-        graph.feeds[kind].watch(unused)
+        graph.feeds[kind].add_watcher(unused)
     graph.newest("skin_mesh")
     nodes = graph.bench.publisher(PointCloud2, "skin/nodes")
     for wrong in (SQUARE[:3], SQUARE * np.nan):
@@ -309,7 +309,7 @@ def test_tissue_comes_with_its_outer_faces_and_strain_when_asked_for(graph):
     graph.latch(PointCloud2, "tissue/rest", cloud(MESH.nodes))
     graph.latch(Int32MultiArray, "tissue/tetrahedra", tetrahedra_message(MESH.tetrahedra))
     for kind in ("tissue_mesh", "tissue", "strain"):
-        graph.feeds[kind].watch(unused)
+        graph.feeds[kind].add_watcher(unused)
     told = graph.newest("tissue_mesh")
     assert told.header["points"] == len(MESH.nodes) == 64
     assert told.header["triangles"] == 6 * 9 * 2
@@ -330,7 +330,7 @@ def test_tetrahedra_of_nodes_that_there_are_not_are_refused(graph):
     huge = MESH.tetrahedra.copy()
     huge[3, 2] = 2**30
     graph.latch(Int32MultiArray, "tissue/tetrahedra", tetrahedra_message(huge))
-    graph.feeds["tissue_mesh"].watch(unused)
+    graph.feeds["tissue_mesh"].add_watcher(unused)
     graph.bench.spin_until(lambda: graph.node.health.problems("mesh") > 0)
     assert graph.feeds["tissue_mesh"].newest() is None
 
@@ -338,12 +338,12 @@ def test_tetrahedra_of_nodes_that_there_are_not_are_refused(graph):
 def test_structures_are_heard_once_and_carried_from_then_on(graph):
     graph.latch(PointCloud2, "tissue/rest", cloud(MESH.nodes))
     graph.latch(Int32MultiArray, "tissue/tetrahedra", tetrahedra_message(MESH.tetrahedra))
-    graph.feeds["structures"].watch(unused)
+    graph.feeds["structures"].add_watcher(unused)
     markers = graph.bench.publisher(MarkerArray, "tissue/structures")
     nodes = graph.bench.publisher(PointCloud2, "tissue/nodes")
     deformed = MESH.nodes + np.array([0, 0, 0.002])
     corners = (SMALL + np.array([0, 0, 0.002]))[CLOSED.ravel()]
-    vein = Shape("vein", (0.2, 0.4, 0.8, 1.0), corners)
+    vein = MarkerShape("vein", (0.2, 0.4, 0.8, 1.0), corners)
     nodes.publish(cloud(deformed, second=4))
     nodes.publish(cloud(deformed, second=5))
     markers.publish(serialize_markers([vein], Time(sec=5), "patient"))
@@ -356,19 +356,21 @@ def test_structures_are_heard_once_and_carried_from_then_on(graph):
     assert packet.header["parts"][0]["name"] == "vein"
     graph.bench.spin_until(lambda: graph.bench.peer.count_subscribers("tissue/structures") == 0)
     assert graph.bench.peer.count_subscribers("tissue/nodes") == 0
-    graph.structures.forget()  # another scene has the same mesh
+    graph.structures.forget_structures()  # another scene has the same mesh
     assert graph.feeds["structures"].newest() is None
     graph.bench.spin_until(lambda: graph.bench.peer.count_subscribers("tissue/structures") == 1)
 
 
 def test_the_probe_comes_with_its_shape_its_pose_and_its_force(graph):
-    parts = transducer_mesh(RoundedBox(length=0.046, width=0.014, height=0.04, rounding=0.004))
-    shapes = [Shape(p.name, (*p.colour, 1.0), p.vertices[p.triangles.ravel()]) for p in parts]
+    parts = build_transducer_mesh(
+        RoundedBox(length=0.046, width=0.014, height=0.04, rounding=0.004)
+    )
+    shapes = [MarkerShape(p.name, (*p.colour, 1.0), p.vertices[p.triangles.ravel()]) for p in parts]
     outline = np.array([[-0.02, 0, 0], [0.02, 0, 0], [0.02, 0, 0.04], [-0.02, 0, 0.04]])
-    shapes.append(Shape("image", (1.0,) * 4, np.concatenate([outline, outline[:1]]), 4e-4))
+    shapes.append(MarkerShape("image", (1.0,) * 4, np.concatenate([outline, outline[:1]]), 4e-4))
     graph.latch(MarkerArray, "probe/marker", serialize_markers(shapes, Time(), "probe"))
     for kind in ("probe_mesh", "probe"):
-        graph.feeds[kind].watch(unused)
+        graph.feeds[kind].add_watcher(unused)
     told = graph.newest("probe_mesh")
     by_name = {part["name"]: part for part in told.header["parts"]}
     assert [by_name[p.name]["triangles"] for p in parts] == [len(p.triangles) for p in parts]

@@ -23,7 +23,7 @@ from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.viewer.remote_parameters import RemoteParameters
 from us_sim.viewer.session import ViewerSession
 from us_sim.viewer.status import StatusListener
-from us_sim.viewer.stream import Posted, Simulator
+from us_sim.viewer.stream import CallPoster, Simulator
 
 EVIL = " ".join(
     (
@@ -50,7 +50,7 @@ def stranger(simulator: Simulator) -> Iterator[None]:
     """Somebody on the graph who says all that nodes say of themselves, with hostile texts."""
     bench = Bench()
     viewer = bench.add(GuardedNode("viewer", context=bench.context))
-    post = Posted(viewer)
+    post = CallPoster(viewer)
     simulator.session = ViewerSession(viewer, post)
     simulator.nodes = RemoteParameters(viewer)
     simulator.status = StatusListener(viewer, post)

@@ -23,12 +23,14 @@ class Images:
 
     def __init__(self, simulator: Simulator) -> None:
         self.feed = Feed("image", rate=None)
-        simulator.add(self.feed)
+        simulator.add_feeds(self.feed)
 
     def show(self, grey: int, **known: Any) -> None:
         stamp = {"stamp": str(grey * 10**9), "encoding": "mono8"}
         header = {"rows": ROWS, "columns": COLUMNS, "matrix": MATRIX, **stamp, **known}
-        self.feed.offer(lambda n: Packet("image", n, header, bytes([grey]) * (ROWS * COLUMNS)))
+        self.feed.offer_packet(
+            lambda n: Packet("image", n, header, bytes([grey]) * (ROWS * COLUMNS))
+        )
 
 
 pytestmark = pytest.mark.usefixtures("images")
@@ -394,8 +396,8 @@ def show_annotated(page: Any, simulator: Simulator, columns: int, rows: int) -> 
     feed = Feed("annotated", rate=None)
     header = {"stamp": str(41 * 10**9), "rows": rows, "columns": columns, "encoding": "jpeg"}
     header["matrix"] = MATRIX
-    feed.offer(lambda n: Packet("annotated", n, header, encoded))
-    simulator.add(feed)
+    feed.offer_packet(lambda n: Packet("annotated", n, header, encoded))
+    simulator.add_feeds(feed)
     page.evaluate("import('/us_sim/assets/image.js').then(m => m.setMode('annotated'))")
     page.wait_for_function(
         f"""() => {{
@@ -468,13 +470,13 @@ def test_a_strip_is_frozen_with_the_image_and_saved_below_it(
     page: Any, simulator: Simulator, tmp_path: Path
 ) -> None:
     feed = Feed("m_mode", rate=None)
-    simulator.add(feed)
+    simulator.add_feeds(feed)
 
     def show(blue: int) -> None:
         strip = np.full((60, 300, 3), (blue, 20, 20), np.uint8)
         encoded = cv2.imencode(".jpg", strip)[1].tobytes()
         header = {"stamp": "1", "rows": 60, "columns": 300, "encoding": "jpeg"}
-        feed.offer(lambda n: Packet("m_mode", n, header, encoded))
+        feed.offer_packet(lambda n: Packet("m_mode", n, header, encoded))
 
     show(200)
     page.evaluate("import('/us_sim/assets/strips.js').then(m => m.showStrip('m_mode', true))")

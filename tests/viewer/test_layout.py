@@ -11,9 +11,9 @@ from fake_hand import FACE, FakeHand, show_patient
 from fake_nodes import FakeNodes
 
 from us_sim.scene.listing import ListedScene
-from us_sim.viewer.parameters import Kind, Parameter
+from us_sim.viewer.parameters import Parameter, ParameterKind
 from us_sim.viewer.session import SessionState
-from us_sim.viewer.status import Level, NodeStatus
+from us_sim.viewer.status import NodeLevel, NodeStatus
 from us_sim.viewer.stream import Simulator
 
 PHONE = 390, 844
@@ -21,11 +21,11 @@ FOUR_TIMES = 320, 180  # what a window of 1280 × 720 holds when magnified
 TABS = ("Image", "Tissue", "Cases", "Session", "Exercise", "Status")
 NODE = "slice_interpolator"
 PARAMETERS = (
-    Parameter(NODE, "depth", Kind.NUMBER, 0.04, unit="mm", size=1e-3, limits=(0.005, 0.4)),
-    Parameter(NODE, "focus", Kind.NUMBER, 0.0, limits=(0.0, 0.4), may_be_nothing=True),
-    Parameter(NODE, "time_gain", Kind.NUMBERS, (0.0,), unit="dB"),
-    Parameter(NODE, "overlay", Kind.TEXT, "none", choices=("none", "strain")),
-    Parameter(NODE, "contact", Kind.TRUTH, False),
+    Parameter(NODE, "depth", ParameterKind.NUMBER, 0.04, unit="mm", size=1e-3, limits=(0.005, 0.4)),
+    Parameter(NODE, "focus", ParameterKind.NUMBER, 0.0, limits=(0.0, 0.4), may_be_nothing=True),
+    Parameter(NODE, "time_gain", ParameterKind.NUMBERS, (0.0,), unit="dB"),
+    Parameter(NODE, "overlay", ParameterKind.TEXT, "none", choices=("none", "strain")),
+    Parameter(NODE, "contact", ParameterKind.TRUTH, False),
 )
 
 Open = Callable[..., Any]
@@ -44,8 +44,10 @@ def hand(simulator: Simulator) -> FakeHand:
         ListedScene("sweep", "case:/sweep", "case", problem="volume.file: is missing"),
     )
     now = time.monotonic()
-    simulator.status.tell(NodeStatus(NODE, Level.WELL, "runs"), now)
-    simulator.status.tell(NodeStatus("probe_tracker", Level.ERROR, "the probe is lost"), now)
+    simulator.status.add_report(NodeStatus(NODE, NodeLevel.WELL, "runs"), now)
+    simulator.status.add_report(
+        NodeStatus("probe_tracker", NodeLevel.ERROR, "the probe is lost"), now
+    )
     return hand
 
 

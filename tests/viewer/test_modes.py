@@ -9,8 +9,8 @@ import pytest
 from awaiting import until
 from fake_nodes import FakeNodes
 
-from us_sim.viewer.parameters import Kind, Parameter
-from us_sim.viewer.status import Level, NodeStatus
+from us_sim.viewer.parameters import Parameter, ParameterKind
+from us_sim.viewer.status import NodeLevel, NodeStatus
 from us_sim.viewer.stream import Feed, Packet, Simulator
 
 NODE = "slice_interpolator"
@@ -19,9 +19,14 @@ PIXEL += "c.getContext('2d').getImageData(5, 5, 1, 1).data).slice(0, 3) : null; 
 
 
 def known(value: str, is_flipped: bool = False) -> list[Parameter]:
-    overlay = Parameter(NODE, "overlay", Kind.TEXT, value, choices=("none", "strain", "velocity"))
+    overlay = Parameter(
+        NODE, "overlay", ParameterKind.TEXT, value, choices=("none", "strain", "velocity")
+    )
     switches = {"flip": is_flipped, "beside": False}
-    return [overlay, *(Parameter(NODE, name, Kind.TRUTH, on) for name, on in switches.items())]
+    return [
+        overlay,
+        *(Parameter(NODE, name, ParameterKind.TRUTH, on) for name, on in switches.items()),
+    ]
 
 
 @pytest.fixture
@@ -47,8 +52,8 @@ def coloured(simulator: Simulator, kind: str, bgr: tuple[int, int, int]) -> Feed
     picture = np.full((32, 32, 3), bgr, np.uint8)
     jpeg = cv2.imencode(".jpg", picture)[1].tobytes()
     header = {"stamp": "1", "rows": 32, "columns": 32, "encoding": "jpeg"}
-    feed.offer(lambda sequence: Packet(kind, sequence, header, jpeg))
-    simulator.add(feed)
+    feed.offer_packet(lambda sequence: Packet(kind, sequence, header, jpeg))
+    simulator.add_feeds(feed)
     return feed
 
 
@@ -58,8 +63,8 @@ def test_a_mode_is_asked_for_shown_and_left(
     plain = Feed("image")
     pixels = np.full((32, 32), 90, np.uint8).tobytes()
     header = {"stamp": "1", "rows": 32, "columns": 32, "encoding": "mono8"}
-    plain.offer(lambda sequence: Packet("image", sequence, header, pixels))
-    simulator.add(plain)
+    plain.offer_packet(lambda sequence: Packet("image", sequence, header, pixels))
+    simulator.add_feeds(plain)
     annotated = coloured(simulator, "annotated", (0, 0, 200))
     page.goto(page.address)
     image = PIXEL.format(".us-image")
@@ -90,7 +95,9 @@ def test_a_refused_mode_says_why_and_stays_as_it_was(page: Any, simulator: Simul
 @pytest.mark.usefixtures("asked")
 def test_why_an_image_shows_little_is_said_on_it(page: Any, simulator: Simulator) -> None:
     def see(**values: str) -> None:
-        simulator.status.tell(NodeStatus(NODE, Level.WELL, "imaging", values), time.monotonic())
+        simulator.status.add_report(
+            NodeStatus(NODE, NodeLevel.WELL, "imaging", values), time.monotonic()
+        )
 
     def is_said(*words: str) -> None:
         page.wait_for_function(
@@ -116,15 +123,15 @@ def test_why_an_image_shows_little_is_said_on_it(page: Any, simulator: Simulator
     is_said("Poor contact", "No spectrum: no vessel")
     see(contact="good", no_colour="", no_spectrum="")
     is_said()
-    tissue = NodeStatus("tissue_deformer", Level.WELL, "fem", {"force": "24.20"})
-    simulator.status.tell(tissue, time.monotonic())
+    tissue = NodeStatus("tissue_deformer", NodeLevel.WELL, "fem", {"force": "24.20"})
+    simulator.status.add_report(tissue, time.monotonic())
     is_said("Too much force: 24 N")
     words = "3 tetrahedra are inside out: msds is not made for this (set solver)"
-    tissue = NodeStatus("tissue_deformer", Level.WARNING, words, {"problem": "inside out"})
-    simulator.status.tell(tissue, time.monotonic())
+    tissue = NodeStatus("tissue_deformer", NodeLevel.WARNING, words, {"problem": "inside out"})
+    simulator.status.add_report(tissue, time.monotonic())
     is_said("Tissue is inside out")
-    tissue = NodeStatus("tissue_deformer", Level.WELL, "fem", {"unbalanced": "1"})
-    simulator.status.tell(tissue, time.monotonic())
+    tissue = NodeStatus("tissue_deformer", NodeLevel.WELL, "fem", {"unbalanced": "1"})
+    simulator.status.add_report(tissue, time.monotonic())
     is_said()
 
 

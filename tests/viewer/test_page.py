@@ -10,7 +10,7 @@ import pytest
 from awaiting import until
 
 from us_sim.errors import UsSimError
-from us_sim.viewer.server import listening
+from us_sim.viewer.server import open_socket
 from us_sim.viewer.stream import Feed, Packet, Simulator
 
 PIXEL = 1e-4  # m
@@ -26,13 +26,13 @@ def offer(feed: Feed, pixels: Any) -> None:
     rows, columns = pixels.shape
     header = {"stamp": "1", "rows": rows, "columns": columns, "encoding": "mono8"}
     header["matrix"] = MATRIX
-    feed.offer(lambda sequence: Packet("image", sequence, header, pixels.tobytes()))
+    feed.offer_packet(lambda sequence: Packet("image", sequence, header, pixels.tobytes()))
 
 
 def feeds_of(simulator: Simulator) -> tuple[Feed, list[bool]]:
     told: list[bool] = []
     image = Feed("image", told.append)
-    simulator.add(image)
+    simulator.add_feeds(image)
     return image, told
 
 
@@ -57,10 +57,10 @@ def test_an_image_is_not_said_to_be_still_where_nothing_comes(
 ) -> None:
     image, _ = feeds_of(simulator)
     hand, probe = Feed("hand", rate=None), Feed("probe", rate=None)
-    simulator.add(hand, probe)
+    simulator.add_feeds(hand, probe)
     place = {"stamp": "1", "position": [0, 0, 0], "quaternion": [0, 0, 0, 1], **force}
-    probe.offer(lambda sequence: Packet("probe", sequence, place, b""))
-    hand.offer(lambda sequence: Packet("hand", sequence, {"is_resting": True}, b""))
+    probe.offer_packet(lambda sequence: Packet("probe", sequence, place, b""))
+    hand.offer_packet(lambda sequence: Packet("hand", sequence, {"is_resting": True}, b""))
     page.goto(page.address)
 
     def is_at_rest() -> bool:
@@ -123,13 +123,13 @@ def test_a_path_that_is_not_there_leaves_nothing_in_the_log(
 def test_a_taken_port_is_said(served: Any) -> None:
     server, _ = served
     with pytest.raises(UsSimError, match=f"port {server.port} of 127.0.0.1 is taken"):
-        listening("127.0.0.1", server.port)
+        open_socket("127.0.0.1", server.port)
     with pytest.raises(UsSimError, match=r"--host no\.such\.host\.invalid"):
-        listening("no.such.host.invalid", 0)
+        open_socket("no.such.host.invalid", 0)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))  # bound, and not listened at
         with pytest.raises(UsSimError, match="is taken"):
-            listening("127.0.0.1", free.getsockname()[1])
+            open_socket("127.0.0.1", free.getsockname()[1])
 
 
 def test_an_image_that_is_not_followed_by_another_is_marked(

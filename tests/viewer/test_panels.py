@@ -8,14 +8,16 @@ import pytest
 from awaiting import until
 from fake_nodes import FakeNodes
 
-from us_sim.viewer.parameters import Kind, Parameter
-from us_sim.viewer.status import Level, NodeStatus
+from us_sim.viewer.parameters import Parameter, ParameterKind
+from us_sim.viewer.status import NodeLevel, NodeStatus
 from us_sim.viewer.stream import ONLY_WATCHES, Simulator
 
 NODE = "slice_interpolator"
 
 
-def made(name: str, kind: Kind = Kind.NUMBER, raw: Any = 0.0, **fields: Any) -> Parameter:
+def made(
+    name: str, kind: ParameterKind = ParameterKind.NUMBER, raw: Any = 0.0, **fields: Any
+) -> Parameter:
     return Parameter(NODE, name, kind, raw, description=f"the {name}", **fields)
 
 
@@ -23,12 +25,12 @@ PARAMETERS = (
     made("depth", raw=0.04, unit="mm", size=1e-3, limits=(0.005, 0.4)),
     made("gain", unit="dB", limits=(-60.0, 60.0)),
     made("focus", unit="mm", size=1e-3, limits=(0.0, 0.4), may_be_nothing=True),
-    made("time_gain", Kind.NUMBERS, (0.0,), unit="dB"),
-    made("overlay", Kind.TEXT, "none", choices=("none", "strain")),
-    made("contact", Kind.TRUTH, False),
-    made("colour.pulses", Kind.WHOLE, 10, limits=(3, 64)),
-    made("flow.direction", Kind.NUMBERS, (0.0, 1.0, 0.0)),
-    made("scene", Kind.TEXT, "arm", is_live=False),
+    made("time_gain", ParameterKind.NUMBERS, (0.0,), unit="dB"),
+    made("overlay", ParameterKind.TEXT, "none", choices=("none", "strain")),
+    made("contact", ParameterKind.TRUTH, False),
+    made("colour.pulses", ParameterKind.WHOLE, 10, limits=(3, 64)),
+    made("flow.direction", ParameterKind.NUMBERS, (0.0, 1.0, 0.0)),
+    made("scene", ParameterKind.TEXT, "arm", is_live=False),
 )
 
 
@@ -210,9 +212,9 @@ def test_status_and_plots(page: Any, simulator: Simulator, node: Node) -> None:
 
     def tell() -> None:
         now = time.monotonic()
-        board.tell(NodeStatus("tissue_deformer", Level.WELL, "fem", values), now)
-        board.tell(NodeStatus("probe_tracker", Level.ERROR, "the probe is lost", {}), now)
-        board.feel(4.25, now - 1.0)
+        board.add_report(NodeStatus("tissue_deformer", NodeLevel.WELL, "fem", values), now)
+        board.add_report(NodeStatus("probe_tracker", NodeLevel.ERROR, "the probe is lost", {}), now)
+        board.add_force(4.25, now - 1.0)
 
     def rows() -> list[str]:
         tell()

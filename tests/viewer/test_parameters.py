@@ -23,10 +23,10 @@ from us_sim.errors import SettingsError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.parameters import LiveSettings
 from us_sim.nodes.settings import TissueDeformerSettings
-from us_sim.settings.quantity import Quantity, dial_unit, units_of
+from us_sim.settings.quantity import Quantity, choose_dial_unit, units_of
 from us_sim.settings.registry import SOLVERS
 from us_sim.slicing.settings import ColourSettings, Imaging
-from us_sim.viewer.parameters import Kind, Parameter
+from us_sim.viewer.parameters import Parameter, ParameterKind
 from us_sim.viewer.remote_parameters import (
     ABSENT,
     SILENT,
@@ -49,10 +49,12 @@ QUANTITIES = [
 
 
 def parameter(quantity: Quantity, raw: float = 0.0, **fields: object) -> Parameter:
-    unit = dial_unit(quantity)
+    unit = choose_dial_unit(quantity)
     size = units_of(quantity.unit).get(unit, 1.0)
     limits = quantity.minimum, quantity.maximum
-    return Parameter("n", "x", Kind.NUMBER, raw, unit=unit, size=size, limits=limits, **fields)
+    return Parameter(
+        "n", "x", ParameterKind.NUMBER, raw, unit=unit, size=size, limits=limits, **fields
+    )
 
 
 @pytest.mark.parametrize(
@@ -69,12 +71,18 @@ def parameter(quantity: Quantity, raw: float = 0.0, **fields: object) -> Paramet
 def test_a_number_is_shown_in_the_unit_that_people_read(quantity, raw, shown, unit):
     made = parameter(quantity, raw)
     assert (made.value, made.unit) == (shown, unit)
-    assert made.raw_of(shown) == pytest.approx(raw, rel=1e-15)
+    assert made.convert_to_raw(shown) == pytest.approx(raw, rel=1e-15)
 
 
 def test_a_handy_number_of_millimetres_is_the_float_that_a_person_would_write():
     made = parameter(QUANTITIES[0])
-    assert [made.raw_of(n) for n in (0.3, 1, 7, 40, 55)] == [0.0003, 0.001, 0.007, 0.04, 0.055]
+    assert [made.convert_to_raw(n) for n in (0.3, 1, 7, 40, 55)] == [
+        0.0003,
+        0.001,
+        0.007,
+        0.04,
+        0.055,
+    ]
 
 
 @given(st.sampled_from(QUANTITIES), st.floats(0.0, 1.0))
@@ -82,7 +90,7 @@ def test_what_is_shown_comes_back_as_it_was(quantity, share):
     raw = quantity.minimum + share * (quantity.maximum - quantity.minimum)
     made = parameter(quantity, raw)
     assert made.low <= made.value <= made.high
-    back = made.raw_of(made.value)
+    back = made.convert_to_raw(made.value)
     assert math.isclose(back, raw, rel_tol=2e-11, abs_tol=1e-300)
     assert quantity.minimum <= back <= quantity.maximum
     assert made.with_raw(back).value == pytest.approx(made.value, rel=2e-11)
@@ -91,50 +99,50 @@ def test_what_is_shown_comes_back_as_it_was(quantity, share):
 @pytest.mark.parametrize("quantity", QUANTITIES)
 def test_the_ends_of_a_range_will_do_although_they_were_rounded(quantity):
     made = parameter(quantity)
-    assert made.raw_of(made.low) == quantity.minimum
-    assert made.raw_of(made.high) == quantity.maximum
+    assert made.convert_to_raw(made.low) == quantity.minimum
+    assert made.convert_to_raw(made.high) == quantity.maximum
 
 
 @pytest.mark.parametrize(
     ("kind", "raw", "nothing"),
     [
-        (Kind.NUMBER, 3.5, 0.0),
-        (Kind.TEXT, "fem", ""),
-        (Kind.NUMBERS, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0)),
+        (ParameterKind.NUMBER, 3.5, 0.0),
+        (ParameterKind.TEXT, "fem", ""),
+        (ParameterKind.NUMBERS, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0)),
     ],
 )
 def test_nothing_is_the_value_that_parameters_have_for_it(kind, raw, nothing):
     made = Parameter("n", "x", kind, raw, may_be_nothing=True)
     assert made.value == raw
-    assert made.raw_of(None) == nothing
+    assert made.convert_to_raw(None) == nothing
     assert made.with_raw(nothing).value is None
     with pytest.raises(SettingsError, match="x needs a value"):
-        Parameter("n", "x", kind, raw).raw_of(None)
+        Parameter("n", "x", kind, raw).convert_to_raw(None)
 
 
 @pytest.mark.parametrize(
     ("kind", "value", "word"),
     [
-        (Kind.NUMBER, "much", "not a number"),
-        (Kind.NUMBER, math.nan, "not a number"),
-        (Kind.NUMBER, -3.5, "-3.5 mm is outside 5 to 400 mm"),
-        (Kind.WHOLE, 1.5, "not a whole number"),
-        (Kind.WHOLE, 1e19, "whole number below"),
-        (Kind.TRUTH, 3, "3 is not what"),
-        (Kind.NUMBERS, [1, "x"], "'x' is not a number"),
-        (Kind.OTHER, 3, "3 is not what"),
+        (ParameterKind.NUMBER, "much", "not a number"),
+        (ParameterKind.NUMBER, math.nan, "not a number"),
+        (ParameterKind.NUMBER, -3.5, "-3.5 mm is outside 5 to 400 mm"),
+        (ParameterKind.WHOLE, 1.5, "not a whole number"),
+        (ParameterKind.WHOLE, 1e19, "whole number below"),
+        (ParameterKind.TRUTH, 3, "3 is not what"),
+        (ParameterKind.NUMBERS, [1, "x"], "'x' is not a number"),
+        (ParameterKind.OTHER, 3, "3 is not what"),
     ],
 )
 def test_what_is_no_value_is_refused_in_a_sentence_in_the_unit_that_is_shown(kind, value, word):
     made = Parameter("n", "x", kind, 0, limits=(0.005, 0.4), unit="mm", size=1e-3)
     with pytest.raises(SettingsError, match=word):
-        made.raw_of(value)
+        made.convert_to_raw(value)
 
 
 def test_lists_are_numbers_in_the_unit_that_is_shown():
-    made = Parameter("n", "x", Kind.NUMBERS, (0.001, 0.02), unit="mm", size=1e-3)
+    made = Parameter("n", "x", ParameterKind.NUMBERS, (0.001, 0.02), unit="mm", size=1e-3)
     assert made.value == (1.0, 20.0)
-    assert made.raw_of(["3", 4]) == (0.003, 0.004)
+    assert made.convert_to_raw(["3", 4]) == (0.003, 0.004)
 
 
 class Pages:
@@ -161,11 +169,11 @@ class Pages:
         return future.result()
 
     def set(self, name: str, parameter: str, value: Any) -> str:
-        return self.call(lambda: self.nodes.of(name).set(parameter, value))
+        return self.call(lambda: self.nodes.get_node(name).set_value(parameter, value))
 
     def look_at(self, name: str) -> NodeParameters:
-        node = self.nodes.of(name)
-        self.call(node.watch)
+        node = self.nodes.get_node(name)
+        self.call(node.add_page)
         self._bench.spin_until(lambda: node.state == THERE)
         return node
 
@@ -218,19 +226,19 @@ def test_a_node_of_ours_says_units_ranges_choices_and_meanings(bench, pages):
     def said(name: str, *fields: str) -> list[Any]:
         return [getattr(known[name], field) for field in fields]
 
-    gain = [Kind.NUMBER, 0.0, "dB", -60.0, 60.0, "added to every echo", True]
+    gain = [ParameterKind.NUMBER, 0.0, "dB", -60.0, 60.0, "added to every echo", True]
     assert said("gain", "kind", "value", "unit", "low", "high", "description", "is_live") == gain
     assert said("elevation_width", "value", "unit") == [2.0, "mm"]
     depth = [None, True, "mm", 400.0]
     assert said("colour.depth", "value", "may_be_nothing", "unit", "high") == depth
-    assert said("elevation_planes", "kind", "value", "high") == [Kind.WHOLE, 1, 15]
+    assert said("elevation_planes", "kind", "value", "high") == [ParameterKind.WHOLE, 1, 15]
     assert said("grey_map", "choices") == [("linear", "soft", "contrast")]
     assert said("contact", "value") == [False]
     assert said("time_gain", "value") == [(0.0,)]
     assert said("colour.nyquist_velocity", "value", "unit") == [30.0, "cm/s"]
     assert said("colour.steering", "unit") == ["deg"]
-    assert said("own.solver", "choices", "meanings") == [SOLVERS.names, SOLVERS.in_short]
-    assert said("own.compare_with", "meanings") == [SOLVERS.in_short]
+    assert said("own.solver", "choices", "meanings") == [SOLVERS.names, SOLVERS.summaries]
+    assert said("own.compare_with", "meanings") == [SOLVERS.summaries]
 
 
 def test_a_value_is_set_in_the_unit_that_is_shown(bench, pages):
@@ -308,10 +316,10 @@ def test_a_foreign_node_s_plain_descriptors_will_do(bench, pages):
     node.declare_parameter("flags", [True, False])
     known = pages.look_at("motor").parameters
     assert (known["speed"].value, known["speed"].unit, known["speed"].low) == (3.5, "", None)
-    assert known["name"].kind is Kind.TEXT
+    assert known["name"].kind is ParameterKind.TEXT
     assert (known["reach"].value, known["reach"].unit, known["reach"].high) == (0.5, "", 2.0)
     assert (known["turns"].description, known["turns"].is_live) == ("a minute (rpm)", False)
-    assert (known["flags"].kind, known["flags"].is_live) == (Kind.OTHER, False)
+    assert (known["flags"].kind, known["flags"].is_live) == (ParameterKind.OTHER, False)
     assert pages.set("motor", "speed", 4) == ""
     assert node.get_parameter("speed").value == 4.0
     node.add_on_set_parameters_callback(lambda _: SetParametersResult(successful=False))
@@ -335,7 +343,7 @@ def test_a_node_without_parameter_services_is_silent(bench, pages, monkeypatch):
     monkeypatch.setattr("us_sim.viewer.remote_parameters.ANSWER_S", 0.1)
     bench.add(Node("mute", context=bench.context, start_parameter_services=False))
     shown = pages.nodes.of("mute")
-    pages.call(shown.watch)
+    pages.call(shown.add_page)
     bench.spin_until(lambda: shown.state == SILENT)
     assert "no parameter" in pages.set("mute", "gain", 1)
 
@@ -352,9 +360,9 @@ def test_nothing_is_asked_while_nobody_looks(bench, pages):
     console(bench)
     shown = pages.look_at("console")
     pages.look_at("console")
-    pages.call(shown.unwatch)
+    pages.call(shown.remove_page)
     heard(bench)
-    pages.call(shown.unwatch)
+    pages.call(shown.remove_page)
     bench.spin_until(lambda: bench.peer.count_subscribers("/parameter_events") == 0)
     assert "gain" in pages.look_at("console").parameters  # read anew when somebody does again
 

@@ -7,11 +7,11 @@ import pytest
 from awaiting import until
 from fake_nodes import FakeNodes
 
-from us_sim.slicing.probe.beams import pixels_of
-from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, image_outline
-from us_sim.viewer.parameters import Kind, Parameter
+from us_sim.slicing.probe.beams import convert_to_pixels
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, compute_image_outline
+from us_sim.viewer.parameters import Parameter, ParameterKind
 from us_sim.viewer.stream import Feed, Packet, Simulator
-from us_sim.viewer.surfaces import transducer_packet
+from us_sim.viewer.surfaces import make_transducer_packet
 
 NODE = "slice_interpolator"
 LINEAR = LinearProbe(aperture=0.04, depth=0.04, columns=200, rows=200)
@@ -36,22 +36,22 @@ class Node:
             matrix[0] *= -1
         header = {"matrix": matrix.ravel().tolist()}
         header |= {"stamp": "1", "rows": probe.rows, "columns": probe.columns}
-        outline = image_outline(probe)
+        outline = compute_image_outline(probe)
         packets = {
-            "probe_mesh": lambda n: transducer_packet("probe_mesh", n, [], outline),
+            "probe_mesh": lambda n: make_transducer_packet("probe_mesh", n, [], outline),
             "image_geometry": lambda n: Packet("image_geometry", n, header, b""),
             "image": lambda n: Packet(
                 "image", n, header | {"encoding": "mono8"}, bytes(probe.rows * probe.columns)
             ),
         }
         for kind, pack in packets.items():
-            simulator.add(Feed(kind))
-            simulator.feeds[kind].offer(pack)
+            simulator.add_feeds(Feed(kind))
+            simulator.feeds[kind].offer_packet(pack)
 
     def _tell(self) -> None:
         made = []
         for name, value in self.values.items():
-            kind = Kind.TEXT if isinstance(value, str) else Kind.NUMBER
+            kind = ParameterKind.TEXT if isinstance(value, str) else ParameterKind.NUMBER
             size = 1e-3 if name.endswith(("depth", "height", "size")) else 1.0
             made.append(Parameter(NODE, name, kind, value, size=size))
         self._nodes.tell(*made)
@@ -80,7 +80,7 @@ def test_what_is_dragged_looks_where_it_was_dragged_to(
         depth = node.values.get(f"{kind}.depth", 0.5 * probe.depth)
         lateral = np.array([node.values[f"{kind}.lateral"]])
         leaning = steering if kind == "spectrum" else 0.0
-        return pixels_of(probe, lateral, np.array([depth]), leaning)[0]
+        return convert_to_pixels(probe, lateral, np.array([depth]), leaning)[0]
 
     page.goto(page.address)
     page.wait_for_function("document.querySelector('.us-image')?.width === 200")

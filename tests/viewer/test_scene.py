@@ -11,12 +11,17 @@ import pytest
 from PIL import Image
 
 from us_sim.geometry.collider import RoundedBox
-from us_sim.geometry.transducer import transducer_mesh
+from us_sim.geometry.transducer import build_transducer_mesh
 from us_sim.skin.surface import plane_surface
-from us_sim.slicing.probe.probe import LinearProbe, image_outline
+from us_sim.slicing.probe.probe import LinearProbe, compute_image_outline
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.viewer.stream import Feed, Packet, Simulator
-from us_sim.viewer.surfaces import CarriedSurfaces, ColouredSurface, RestSurface, transducer_packet
+from us_sim.viewer.surfaces import (
+    CarriedSurfaces,
+    ColouredSurface,
+    StreamedSurface,
+    make_transducer_packet,
+)
 
 LIMIT_MS = 60_000
 SCENE = "import('/us_sim/assets/scene/scene.js')"
@@ -40,14 +45,14 @@ class Patient:
     def __init__(self, simulator: Simulator) -> None:
         faces = MESH.boundary
         edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-        self.tissue = RestSurface(MESH.nodes, faces, edges)
-        self.skin = RestSurface(SKIN.vertices, SKIN.triangles)
+        self.tissue = StreamedSurface(MESH.nodes, faces, edges)
+        self.skin = StreamedSurface(SKIN.vertices, SKIN.triangles)
         cubes = [cube("vein", (0.25, 0.4, 0.85), VEIN), cube("artery", (0.85, 0.15, 0.15), ARTERY)]
         structures = CarriedSurfaces(MESH, cubes)
         collider = RoundedBox(length=0.046, width=0.014, height=0.04, rounding=0.004)
         parts = [
             ColouredSurface(part.name, part.colour, part.vertices, part.triangles)
-            for part in transducer_mesh(collider)
+            for part in build_transducer_mesh(collider)
         ]
         kinds = [
             "skin_mesh",
@@ -60,12 +65,14 @@ class Patient:
             "probe",
         ]
         self.feeds = {kind: Feed(kind) for kind in [*kinds, "image", "score"]}
-        simulator.add(*self.feeds.values())
-        self._offer("skin_mesh", lambda n: self.skin.told("skin_mesh", n))
-        self._offer("tissue_mesh", lambda n: self.tissue.told("tissue_mesh", n))
-        self._offer("structures", lambda n: structures.told("structures", n, self.tissue.number))
-        outline = image_outline(PROBE)
-        self._offer("probe_mesh", lambda n: transducer_packet("probe_mesh", n, parts, outline))
+        simulator.add_feeds(*self.feeds.values())
+        self._offer("skin_mesh", lambda n: self.skin.make_rest_packet("skin_mesh", n))
+        self._offer("tissue_mesh", lambda n: self.tissue.make_rest_packet("tissue_mesh", n))
+        self._offer(
+            "structures", lambda n: structures.make_rest_packet("structures", n, self.tissue.number)
+        )
+        outline = compute_image_outline(PROBE)
+        self._offer("probe_mesh", lambda n: make_transducer_packet("probe_mesh", n, parts, outline))
         self.show(200)
         self.push()
         self.move(np.zeros(3))
@@ -81,12 +88,15 @@ class Patient:
         """All tissue from rest, m."""
         moved = MESH.nodes + shift
         self._offer(
-            "tissue", lambda n: self.tissue.moved(moved, kind="tissue", sequence=n, stamp=stamp)
+            "tissue",
+            lambda n: self.tissue.make_packet(moved, kind="tissue", sequence=n, stamp=stamp),
         )
 
     def dent(self, vertices: np.ndarray) -> None:
         """The skin elsewhere than at rest."""
-        self._offer("skin", lambda n: self.skin.moved(vertices, kind="skin", sequence=n, stamp=0))
+        self._offer(
+            "skin", lambda n: self.skin.make_packet(vertices, kind="skin", sequence=n, stamp=0)
+        )
 
     def strain(self, values: np.ndarray) -> None:
         """Of each node."""
@@ -100,7 +110,7 @@ class Patient:
         self._offer("image", lambda n: Packet("image", n, header, bytes([grey]) * (48 * 64)))
 
     def _offer(self, kind: str, pack: Callable[[int], Packet]) -> None:
-        self.feeds[kind].offer(pack)
+        self.feeds[kind].offer_packet(pack)
 
 
 @pytest.fixture

@@ -210,7 +210,7 @@ def test_pages_of_others_name_what_is_listed_and_record_to_one_folder(asked, fil
             send=lambda v, s=sent: s.append(v), folder="/recordings", is_own=is_own
         )
         board.state = RUNNING
-        told = board.ask(**asked)
+        told = board.ask_control(**asked)
         if is_own or file:
             assert sent
             assert not file or sent == [{"record": file}]

@@ -11,8 +11,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 
 from us_sim.nodes.guarded_node import GuardedNode, Health
-from us_sim.viewer.status import GONE_S, Level, NodeStatus, StatusBoard, StatusListener
-from us_sim.viewer.stream import Posted
+from us_sim.viewer.status import GONE_S, NodeLevel, NodeStatus, StatusBoard, StatusListener
+from us_sim.viewer.stream import CallPoster
 
 VALUES = {
     "state": "fem",
@@ -27,133 +27,141 @@ VALUES = {
 }
 
 
-def said(name: str = "tissue_deformer", level: Level = Level.WELL, **values: str) -> NodeStatus:
+def said(
+    name: str = "tissue_deformer", level: NodeLevel = NodeLevel.WELL, **values: str
+) -> NodeStatus:
     return NodeStatus(name, level, "fem", VALUES | values)
 
 
 def test_the_numbers_that_a_node_says_are_read():
     status = said()
-    assert (status.number("rate_hz"), status.number("dropped"), status.problems) == (59.5, 4, 6)
-    assert (status.state, status.number("residual"), status.number("nonsense")) == (
+    assert (status.read_number("rate_hz"), status.read_number("dropped"), status.problems) == (
+        59.5,
+        4,
+        6,
+    )
+    assert (status.state, status.read_number("residual"), status.read_number("nonsense")) == (
         "fem",
         None,
         None,
     )
-    assert NodeStatus("camera", Level.WELL, "waits").state == "waits"
+    assert NodeStatus("camera", NodeLevel.WELL, "waits").state == "waits"
 
 
 def test_a_problem_is_remembered_after_the_node_is_well_again():
     board = StatusBoard()
-    board.tell(NodeStatus("a", Level.WARNING, "the probe is lost"), now=1.0)
-    board.tell(NodeStatus("a", Level.WELL, "tracked"), now=2.0)
-    (status,) = board.nodes(now=2.5)
-    assert (status.level, status.message) == (Level.WELL, "tracked")
+    board.add_report(NodeStatus("a", NodeLevel.WARNING, "the probe is lost"), now=1.0)
+    board.add_report(NodeStatus("a", NodeLevel.WELL, "tracked"), now=2.0)
+    (status,) = board.list_nodes(now=2.5)
+    assert (status.level, status.message) == (NodeLevel.WELL, "tracked")
     assert (status.problem, status.problem_heard) == ("the probe is lost", 1.0)
 
 
 def test_a_silent_node_is_gone_and_later_forgotten():
     board = StatusBoard()
-    board.tell(said("b"), now=0.0)
-    board.tell(said("a"), now=2.0)
-    assert [s.name for s in board.nodes(now=2.9)] == ["a", "b"]
-    assert [s.level for s in board.nodes(now=3.1)] == [Level.WELL, Level.GONE]
-    assert board.node("b", now=3.1).number("rate_hz") is None
-    assert [s.name for s in board.nodes(now=60.5)] == ["a"]
-    assert board.node("c", now=3.0) is None
+    board.add_report(said("b"), now=0.0)
+    board.add_report(said("a"), now=2.0)
+    assert [s.name for s in board.list_nodes(now=2.9)] == ["a", "b"]
+    assert [s.level for s in board.list_nodes(now=3.1)] == [NodeLevel.WELL, NodeLevel.GONE]
+    assert board.find_node("b", now=3.1).read_number("rate_hz") is None
+    assert [s.name for s in board.list_nodes(now=60.5)] == ["a"]
+    assert board.find_node("c", now=3.0) is None
 
 
 def test_nobody_is_silent_who_was_not_listened_to():
     board = StatusBoard()
-    board.watch()
+    board.add_page()
     begun = time.monotonic()
-    board.tell(said("a"), now=begun - 2 * GONE_S)
-    assert [s.level for s in board.nodes(begun + 0.5)] == [Level.WELL]
-    assert [s.level for s in board.nodes(begun + GONE_S + 0.5)] == [Level.GONE]
-    board.watch()  # another page, which changes nothing
-    assert [s.level for s in board.nodes(begun + GONE_S + 0.5)] == [Level.GONE]
+    board.add_report(said("a"), now=begun - 2 * GONE_S)
+    assert [s.level for s in board.list_nodes(begun + 0.5)] == [NodeLevel.WELL]
+    assert [s.level for s in board.list_nodes(begun + GONE_S + 0.5)] == [NodeLevel.GONE]
+    board.add_page()  # another page, which changes nothing
+    assert [s.level for s in board.list_nodes(begun + GONE_S + 0.5)] == [NodeLevel.GONE]
 
 
 def test_histories_are_of_the_numbers_that_are_plotted_and_bounded():
     board = StatusBoard()
     for second in range(300):
-        board.tell(said(rate_hz=str(second)), now=float(second))
-    history = board.history("rate_hz", since=240.0)["tissue_deformer"]
+        board.add_report(said(rate_hz=str(second)), now=float(second))
+    history = board.get_history("rate_hz", since=240.0)["tissue_deformer"]
     assert history == [(float(s), float(s)) for s in range(241, 300)]
-    assert len(board.history("rate_hz", since=0.0)["tissue_deformer"]) == 100
-    assert board.history("residual", since=0.0) == {}
-    assert board.history("received", since=0.0) == {}
+    assert len(board.get_history("rate_hz", since=0.0)["tissue_deformer"]) == 100
+    assert board.get_history("residual", since=0.0) == {}
+    assert board.get_history("received", since=0.0) == {}
 
 
 def test_of_the_forces_within_a_tenth_of_a_second_the_largest_is_kept():
     board = StatusBoard()
     for i in range(120):  # 60 a second, for 2 s
-        board.feel(float(i % 6), now=i / 60)
-    forces = board.forces(since=-1.0)
+        board.add_force(float(i % 6), now=i / 60)
+    forces = board.get_forces(since=-1.0)
     assert 18 <= len(forces) <= 20
     assert {force for _, force in forces[:-1]} == {5.0}
-    assert board.forces(since=1.0) == [each for each in forces if each[0] > 1.0]
+    assert board.get_forces(since=1.0) == [each for each in forces if each[0] > 1.0]
     for i in range(10_000):
-        board.feel(1.0, now=10.0 + i)
-    assert len(board.forces(since=0.0)) == 600
+        board.add_force(1.0, now=10.0 + i)
+    assert len(board.get_forces(since=0.0)) == 600
 
 
 def test_only_the_first_who_looks_and_the_last_who_goes_are_told():
     told: list[tuple[bool, bool]] = []
     board = StatusBoard(lambda: told.append((board.is_watched, board.force.is_watched)))
-    board.watch()
-    board.watch()
-    board.force.watch()
-    board.unwatch()
-    board.force.unwatch()
-    board.unwatch()
+    board.add_page()
+    board.add_page()
+    board.force.add_page()
+    board.remove_page()
+    board.force.remove_page()
+    board.remove_page()
     assert told == [(True, False), (True, True), (True, False), (False, False)]
 
 
 def test_nodes_and_the_force_are_heard_while_somebody_looks(bench):
     listening = bench.add(GuardedNode("viewer", context=bench.context))
-    listener = StatusListener(listening, Posted(listening))
+    listener = StatusListener(listening, CallPoster(listening))
     board = listener
     node = bench.add(GuardedNode("tissue_deformer", context=bench.context))
     node.health = Health(node, "arm")
     wrenches = bench.peer.create_publisher(WrenchStamped, "probe/wrench", 10)
     bench.spin_for(5)
     assert bench.peer.count_subscribers("diagnostics") == 0
-    board.watch()
+    board.add_page()
     bench.spin_until(lambda: bench.peer.count_subscribers("diagnostics") == 1)
     node.health.state = "fem"
 
     def heard():
         node.health.report()
-        return any(s.name == "tissue_deformer" and s.state == "fem" for s in board.nodes(now()))
+        return any(
+            s.name == "tissue_deformer" and s.state == "fem" for s in board.list_nodes(now())
+        )
 
     bench.spin_until(heard)
-    assert board.node("tissue_deformer", now()).level is Level.WELL
-    node.health.problem("pose", "the pose is nonsense")
+    assert board.find_node("tissue_deformer", now()).level is NodeLevel.WELL
+    node.health.count_problem("pose", "the pose is nonsense")
 
     def warned():
         node.health.report()
-        return board.node("tissue_deformer", now()).problem == "the pose is nonsense"
+        return board.find_node("tissue_deformer", now()).problem == "the pose is nonsense"
 
     bench.spin_until(warned)
     assert bench.peer.count_subscribers("probe/wrench") == 0
 
-    board.force.watch()
+    board.force.add_page()
     bench.spin_until(lambda: wrenches.get_subscription_count() == 1)
     message = WrenchStamped()
     message.wrench.force.x, message.wrench.force.z = 3.0, -4.0
     message.header.stamp.sec = 1
     wrenches.publish(message)
-    bench.spin_until(lambda: board.forces(since=0.0))
-    assert math.isclose(board.forces(since=0.0)[0][1], 5.0)
+    bench.spin_until(lambda: board.get_forces(since=0.0))
+    assert math.isclose(board.get_forces(since=0.0)[0][1], 5.0)
 
     foreign = bench.peer.create_publisher(DiagnosticArray, "diagnostics", 10)
     status = DiagnosticStatus(name="camera: lens", level=DiagnosticStatus.ERROR, message="dirty")
     bench.spin_until(lambda: foreign.get_subscription_count() == 1)
     foreign.publish(DiagnosticArray(status=[status]))
-    bench.spin_until(lambda: board.node("camera: lens", now()) is not None)
-    assert board.node("camera: lens", now()).level is Level.ERROR
+    bench.spin_until(lambda: board.find_node("camera: lens", now()) is not None)
+    assert board.find_node("camera: lens", now()).level is NodeLevel.ERROR
 
-    board.unwatch()
-    board.force.unwatch()
+    board.remove_page()
+    board.force.remove_page()
     bench.spin_until(lambda: bench.peer.count_subscribers("diagnostics") == 0)
     assert wrenches.get_subscription_count() == 0

@@ -26,7 +26,7 @@ JSON = st.recursive(
 )
 def test_a_packet_comes_back(kind: str, sequence: int, header: dict, payload: bytes) -> None:
     packet = Packet(kind, sequence, header, payload)
-    assert Packet.decoded(packet.encoded) == packet
+    assert Packet.from_bytes(packet.encoded) == packet
     assert (len(packet.encoded) - len(payload)) % 8 == 0
 
 
@@ -36,18 +36,18 @@ def packed(feed: Feed, payload: bytes, made: list[int] | None = None) -> None:
             made.append(sequence)
         return Packet(feed.kind, sequence, {}, payload)
 
-    feed.offer(pack)
+    feed.offer_packet(pack)
 
 
 def test_who_watches_first_and_leaves_last_is_told() -> None:
     told: list[bool] = []
     feed = Feed("image", told.append)
     one, two = (lambda: None), (lambda: None)
-    feed.watch(one)
-    feed.watch(two)
-    feed.unwatch(one)
+    feed.add_watcher(one)
+    feed.add_watcher(two)
+    feed.remove_watcher(one)
     assert told == [True]
-    feed.unwatch(two)
+    feed.remove_watcher(two)
     assert told == [True, False]
     assert not feed.is_watched
 
@@ -56,71 +56,71 @@ def test_only_what_is_taken_is_packed_and_that_once() -> None:
     feed, made = Feed("image"), []
     for _ in range(5):
         packed(feed, b"x", made)
-    assert feed.newest() is feed.newest()
+    assert feed.get_newest() is feed.get_newest()
     assert made == [5]
 
 
 def test_what_cannot_be_packed_is_none_and_not_tried_again() -> None:
     feed, tried = Feed("image"), []
-    feed.offer(lambda sequence: tried.append(sequence))
-    assert feed.newest() is None
-    assert feed.newest() is None
+    feed.offer_packet(lambda sequence: tried.append(sequence))
+    assert feed.get_newest() is None
+    assert feed.get_newest() is None
     assert tried == [1]
 
 
 def stream_of(*feeds: Feed) -> tuple[PageStream, list[None]]:
     simulator, woken = Simulator(), []
-    simulator.add(*feeds)
+    simulator.add_feeds(*feeds)
     return PageStream(simulator, lambda: woken.append(None)), woken
 
 
 def test_a_page_gets_the_newest_when_it_has_drawn_the_last() -> None:
     feed = Feed("image", rate=None)
     page, woken = stream_of(feed)
-    page.take('{"watch": ["image"]}')
+    page.obey_message('{"watch": ["image"]}')
     packed(feed, b"1")
-    assert [Packet.decoded(data).payload for data in page.due(0.0)[0]] == [b"1"]
+    assert [Packet.from_bytes(data).payload for data in page.collect_due(0.0)[0]] == [b"1"]
     packed(feed, b"2")
     packed(feed, b"3")
-    assert page.due(1.0) == ([], None)  # it has not drawn yet
+    assert page.collect_due(1.0) == ([], None)  # it has not drawn yet
     before = len(woken)
-    page.take('{"next": "image"}')
+    page.obey_message('{"next": "image"}')
     assert len(woken) == before + 1
-    assert [Packet.decoded(data).payload for data in page.due(2.0)[0]] == [b"3"]
-    page.take('{"next": "image"}')
-    assert page.due(3.0) == ([], None)  # it has that one
+    assert [Packet.from_bytes(data).payload for data in page.collect_due(2.0)[0]] == [b"3"]
+    page.obey_message('{"next": "image"}')
+    assert page.collect_due(3.0) == ([], None)  # it has that one
 
 
 def test_no_more_than_the_rate_and_the_wait_is_told() -> None:
     feed = Feed("image", rate=10.0)
     page, _ = stream_of(feed)
-    page.take('{"watch": ["image"]}')
+    page.obey_message('{"watch": ["image"]}')
     packed(feed, b"1")
-    assert len(page.due(0.0)[0]) == 1
-    page.take('{"next": "image"}')
+    assert len(page.collect_due(0.0)[0]) == 1
+    page.obey_message('{"next": "image"}')
     packed(feed, b"2")
-    packets, later = page.due(0.06)
+    packets, later = page.collect_due(0.06)
     assert packets == []
     assert later is not None
     assert abs(later - 0.04) < 1e-9
-    assert len(page.due(0.1)[0]) == 1
+    assert len(page.collect_due(0.1)[0]) == 1
 
 
 def test_what_a_page_may_not_say_is_one_sentence() -> None:
     page, _ = stream_of(Feed("image"))
     for text in ("", "[1]", "{", "7", '{"a": 1}', '{"watch": 3}', '{"next": []}', "[" * 60000):
-        wrong = page.take(text)
+        wrong = page.obey_message(text)
         assert wrong is not None
         assert "load the page again" in wrong
-    assert page.take('{"watch": ["unknown", 3, null]}') is None
-    assert page.due(0.0) == ([], None)
+    assert page.obey_message('{"watch": ["unknown", 3, null]}') is None
+    assert page.collect_due(0.0) == ([], None)
 
 
 def test_a_page_that_only_watches_is_refused_every_command() -> None:
     simulator, done = Simulator(feeds={"image": Feed("image")}), []
     simulator.commands["take"] = lambda value, _: done.append(value)
     page = PageStream(simulator, lambda: None, only_watches=True)
-    assert page.take('{"watch": ["image"], "take": "a"}') == ONLY_WATCHES
+    assert page.obey_message('{"watch": ["image"], "take": "a"}') == ONLY_WATCHES
     assert simulator.feeds["image"].is_watched
     assert done == []
 
@@ -128,9 +128,9 @@ def test_a_page_that_only_watches_is_refused_every_command() -> None:
 def test_a_page_that_has_gone_watches_nothing() -> None:
     feed = Feed("image")
     page, _ = stream_of(feed)
-    page.take('{"watch": ["image"]}')
+    page.obey_message('{"watch": ["image"]}')
     assert feed.is_watched
-    page.watch([])
+    page.watch_kinds([])
     assert not feed.is_watched
 
 
@@ -151,13 +151,13 @@ def test_no_more_is_on_its_way_than_the_next_while_one_is_drawn(
     page: Any, simulator: Simulator
 ) -> None:
     slow, quick = Feed("slow", rate=None), Feed("quick", rate=None)
-    simulator.add(slow, quick)
+    simulator.add_feeds(slow, quick)
     page.goto(page.address)
     page.evaluate(TAKE)
     until(lambda: slow.is_watched and quick.is_watched, "the page watches")
 
     def offer(feed: Feed) -> int:
-        feed.offer(lambda sequence: Packet(feed.kind, sequence, {}, b""))
+        feed.offer_packet(lambda sequence: Packet(feed.kind, sequence, {}, b""))
         return feed.sequence
 
     def await_taken(kind: str, number: int) -> None:

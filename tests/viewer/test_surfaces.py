@@ -22,10 +22,10 @@ from us_sim.viewer.surfaces import (
     CarriedSurfaces,
     ColouredSurface,
     EquivalentStrain,
-    RestSurface,
-    at_most,
-    clustered,
-    welded,
+    StreamedSurface,
+    cluster_vertices,
+    simplify_surface,
+    weld_corners,
 )
 
 PLANES = uniform_planes(-0.03, 0.03, 4)
@@ -84,7 +84,7 @@ def test_what_is_not_in_the_tissue_is_refused():
 
 def test_triangles_are_welded_corner_by_corner():
     sheet = grid(0.004)
-    vertices, triangles = welded(sheet.vertices[sheet.triangles].reshape(-1, 3))
+    vertices, triangles = weld_corners(sheet.vertices[sheet.triangles].reshape(-1, 3))
     assert len(vertices) == len(sheet.vertices)
     np.testing.assert_array_equal(vertices[triangles], sheet.vertices[sheet.triangles])
 
@@ -130,7 +130,7 @@ VERTICES, TRIANGLES = sphere()
 @settings(max_examples=30, deadline=None)
 @given(st.floats(0.01, 3.0))
 def test_a_closed_surface_stays_closed(cell):
-    fewer = clustered(VERTICES, TRIANGLES, cell)
+    fewer = cluster_vertices(VERTICES, TRIANGLES, cell)
     assert open_edges(fewer) == 0
     assert len(fewer) <= len(TRIANGLES)
     assert set(fewer.ravel()) <= set(TRIANGLES.ravel())
@@ -139,7 +139,7 @@ def test_a_closed_surface_stays_closed(cell):
 @settings(max_examples=10, deadline=None)
 @given(st.integers(300, 2000))
 def test_half_the_triangles_hold_nearly_the_same_volume(count):
-    fewer = at_most(VERTICES, TRIANGLES, count)
+    fewer = simplify_surface(VERTICES, TRIANGLES, count)
     assert 0.5 * count < len(fewer) <= count
     assert volume(VERTICES, fewer) == pytest.approx(volume(VERTICES, TRIANGLES), rel=0.12)
 
@@ -151,24 +151,24 @@ STRAIN = EquivalentStrain(STRAINED)
 
 def test_a_turn_and_a_shift_are_no_strain():
     turned = STRAINED.nodes @ Rotation.from_rotvec([0.3, -0.5, 0.9]).as_matrix().T + 0.01
-    assert STRAIN.of(turned) == pytest.approx(0.0, abs=1e-12)
+    assert STRAIN.compute_strain(turned) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_stretch_that_keeps_the_volume_is_its_elongation():
     stretch = 1.001
     across = stretch**-0.5
-    strain = STRAIN.of(STRAINED.nodes * [across, across, stretch])
+    strain = STRAIN.compute_strain(STRAINED.nodes * [across, across, stretch])
     assert strain == pytest.approx(0.001, rel=2e-3)
 
 
 def test_swelling_is_none():
-    assert STRAIN.of(STRAINED.nodes * 1.2) == pytest.approx(0.0, abs=1e-12)
+    assert STRAIN.compute_strain(STRAINED.nodes * 1.2) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_simple_shear_is_its_angle_over_the_root_of_three():
     sheared = STRAINED.nodes.copy()
     sheared[:, 0] += 1e-3 * STRAINED.nodes[:, 2]
-    assert STRAIN.of(sheared) == pytest.approx(1e-3 / np.sqrt(3), rel=2e-3)
+    assert STRAIN.compute_strain(sheared) == pytest.approx(1e-3 / np.sqrt(3), rel=2e-3)
 
 
 points = arrays(np.float64, (7, 3), elements=st.floats(-0.3, 0.3))
@@ -177,8 +177,8 @@ points = arrays(np.float64, (7, 3), elements=st.floats(-0.3, 0.3))
 @settings(max_examples=50, deadline=None)
 @given(points, points)
 def test_what_the_page_has_is_half_a_step_from_the_truth(rest, positions):
-    surface = RestSurface(rest, np.zeros((0, 3), dtype=int))
-    packet = surface.moved(positions, kind="skin", sequence=1, stamp=0)
+    surface = StreamedSurface(rest, np.zeros((0, 3), dtype=int))
+    packet = surface.make_packet(positions, kind="skin", sequence=1, stamp=0)
     steps = np.frombuffer(packet.payload, np.int16).reshape(-1, 3)
     back = surface.points + packet.header["resolution"] * steps
     assert np.abs(back - positions).max() <= 0.5 * packet.header["resolution"] + 1e-12
@@ -192,7 +192,7 @@ RESTING = np.array([[0, 1, 2], [0, 2, 3]])
 
 def test_a_surface_at_rest_is_read_as_the_page_does():
     edges = np.array([[0, 1], [2, 3], [0, 2]])
-    packet = RestSurface(SQUARE, RESTING, edges).told("skin_mesh", 3)
+    packet = StreamedSurface(SQUARE, RESTING, edges).make_rest_packet("skin_mesh", 3)
     assert [packet.header[name] for name in ("points", "triangles", "edges")] == [4, 2, 3]
     floats = np.frombuffer(packet.payload, np.float32, 12)
     indices = np.frombuffer(packet.payload, np.uint32, offset=48)
@@ -201,6 +201,6 @@ def test_a_surface_at_rest_is_read_as_the_page_does():
 
 
 def test_another_surface_has_another_number():
-    one, other = RestSurface(SQUARE, RESTING), RestSurface(SQUARE, RESTING[:1])
+    one, other = StreamedSurface(SQUARE, RESTING), StreamedSurface(SQUARE, RESTING[:1])
     assert one.number != other.number
-    assert one.number == RestSurface(SQUARE.copy(), RESTING).number
+    assert one.number == StreamedSurface(SQUARE.copy(), RESTING).number

@@ -23,12 +23,12 @@ from us_sim.nodes.qos import LATCHED
 from us_sim.recording.decoding import nanoseconds_of
 from us_sim.skin.surface import bent_surface, plane_surface
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
-from us_sim.viewer.feeds import RestMesh
+from us_sim.viewer.feeds import RestMeshListener
 from us_sim.viewer.hand import PatientSurface, ViewerHand
 from us_sim.viewer.hand_command import HandCommand
-from us_sim.viewer.parameters import Kind, Parameter
+from us_sim.viewer.parameters import Parameter, ParameterKind
 from us_sim.viewer.session import SessionBoard, SessionState
-from us_sim.viewer.stream import Feed, Posted, Simulator
+from us_sim.viewer.stream import CallPoster, Feed, Simulator
 
 
 class Stander(GuardedNode):
@@ -37,8 +37,8 @@ class Stander(GuardedNode):
     def __init__(self, **kwargs):
         super().__init__("stander", **kwargs)
         self.health = Health(self, "test")
-        self.surface = PatientSurface(self, RestMesh(self))
-        self.surface.listen(True)
+        self.surface = PatientSurface(self, RestMeshListener(self))
+        self.surface.follow_meshes(True)
 
 
 @pytest.fixture
@@ -108,9 +108,9 @@ class Holder(GuardedNode):
     def __init__(self, **kwargs):
         super().__init__("viewer", **kwargs)
         self.health = Health(self, "test")
-        self.post = Posted(self)
+        self.post = CallPoster(self)
         self.simulator = Simulator()
-        self.hand = ViewerHand(self, self.post, self.simulator, RestMesh(self))
+        self.hand = ViewerHand(self, self.post, self.simulator, RestMeshListener(self))
 
 
 class Page:
@@ -126,10 +126,10 @@ class Page:
         return self._holder.simulator.commands["hand"](asked, 1)
 
     def open(self):
-        self.feed.watch(self.nothing)
+        self.feed.add_watcher(self.nothing)
 
     def close(self):
-        self.feed.unwatch(self.nothing)
+        self.feed.remove_watcher(self.nothing)
 
     def nothing(self) -> None:
         """It is told nothing."""
@@ -189,13 +189,13 @@ def test_while_blood_or_time_is_watched_the_resting_probe_is_imaged_as_if_it_mov
     page.open()
     bench.spin_until(lambda: len(tracked) >= 2 and page.state.get("is_resting"))
     simulator = page._holder.simulator
-    overlay = Parameter("slice_interpolator", "overlay", Kind.TEXT, "velocity")
+    overlay = Parameter("slice_interpolator", "overlay", ParameterKind.TEXT, "velocity")
     simulator.nodes.of("slice_interpolator").parameters = {"overlay": overlay}
     for kind in ("m_mode", "spectrum", "annotated"):
         simulator.add(Feed(kind))
-        simulator.feeds[kind].watch(page.nothing)
+        simulator.feeds[kind].add_watcher(page.nothing)
         bench.spin_until(lambda: not page.state["is_resting"])
-        simulator.feeds[kind].unwatch(page.nothing)
+        simulator.feeds[kind].remove_watcher(page.nothing)
         bench.spin_until(lambda: page.state["is_resting"])
 
 
@@ -219,18 +219,18 @@ def test_the_pose_that_contains_a_wish_is_known_by_its_stamp(bench, page, tracke
     page.await_leader("hand")
     bench.spin_until(lambda: len(tracked) >= 1)
     first = nanoseconds_of(tracked[-1].header.stamp)
-    assert hand.pose_facts(first, None)["command"] is None
+    assert hand.describe_pose(first, None)["command"] is None
     page(by={"slide": [0.002, 0.0]})
     page(by={"slide": [0.003, 0.0]})
     bench.spin_until(lambda: tracked[-1].pose.position.x == pytest.approx(0.005, abs=1e-5))
-    facts = [hand.pose_facts(nanoseconds_of(pose.header.stamp), None) for pose in tracked]
+    facts = [hand.describe_pose(nanoseconds_of(pose.header.stamp), None) for pose in tracked]
     answers = [each["command"] for each in facts]
     assert answers[-1] == ("page", 2)
     moved = [a for a, pose in zip(answers, tracked, strict=True) if pose.pose.position.x > 1e-6]
     assert moved[0] is not None
     assert [each["press"] for each in facts] == pytest.approx([depth(pose) for pose in tracked])
-    assert hand.pose_facts(7, None)["press"] is None
-    of_others = hand.pose_facts(7, [0.01, 0.0, 0.004])
+    assert hand.describe_pose(7, None)["press"] is None
+    of_others = hand.describe_pose(7, [0.01, 0.0, 0.004])
     assert of_others["press"] == pytest.approx(0.004)
 
 

@@ -61,28 +61,28 @@ def bag_options(bag: argparse.ArgumentParser) -> None:
 
 
 def _info(args: argparse.Namespace) -> int:
-    from us_sim.recording.reader import describe, read_bag
+    from us_sim.recording.reader import describe_bag, read_bag
 
-    print(describe(read_bag(args.file)))
+    print(describe_bag(read_bag(args.file)))
     return 0
 
 
 def _check(args: argparse.Namespace) -> int:
     from us_sim.progress import late_progress
     from us_sim.recording.reader import read_bag
-    from us_sim.run.session_check import check, report
+    from us_sim.run.session_check import check_bag, format_report
 
-    found = check(read_bag(args.file), late_progress(f"bag check {args.file.name}"))
-    print(report(found))
+    found = check_bag(read_bag(args.file), late_progress(f"bag check {args.file.name}"))
+    print(format_report(found))
     return int(bool(found.findings))
 
 
 def _extract(args: argparse.Namespace) -> int:
-    from us_sim.recording.attached_files import extract
+    from us_sim.recording.attached_files import extract_files
 
     asked = [name for name in _EXTRACTED if vars(args)[name]]
     if not asked:
-        for file in extract(args.file, args.out):
+        for file in extract_files(args.file, args.out):
             print(file)
         return 0
     from us_sim.progress import late_progress
@@ -97,9 +97,9 @@ def _extract(args: argparse.Namespace) -> int:
 
 def _to_lerobot(args: argparse.Namespace) -> int:
     from us_sim.progress import late_progress
-    from us_sim.run.session_lerobot import to_lerobot
+    from us_sim.run.session_lerobot import write_lerobot
 
-    told = to_lerobot(
+    told = write_lerobot(
         args.files,
         args.out,
         args.task,

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.command.calibration_settings import (
-    CameraSettings,
-    ClockSettings,
-    LandmarkSettings,
-    PivotSettings,
+    CameraCalibrationSettings,
+    ClockCalibrationSettings,
+    LandmarkCalibrationSettings,
+    PivotCalibrationSettings,
     Progress,
 )
 from us_sim.errors import CalibrationError
@@ -27,7 +27,7 @@ from us_sim.recording.path import (
     read_path,
     read_tracker_recording,
 )
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import format_count
 from us_sim.tracking.calibration.camera import (
     INTRINSICS,
     BoardView,
@@ -41,8 +41,8 @@ from us_sim.tracking.calibration.landmarks import (
 from us_sim.tracking.calibration.pivot import calibrate_pivot, find_dwells
 from us_sim.tracking.calibration.time_offset import (
     PositionSignal,
+    compute_position_signal,
     find_time_offset,
-    signal_of_positions,
 )
 from us_sim.tracking.calibration.transform_file import (
     read_transform,
@@ -76,7 +76,7 @@ def read_motion(path: Path, name: str | None) -> ProbePath:
                 f"{', '.join(recording.transforms)}, or one such as StylusToReference"
             )
         name = bodies[0]
-    return recording.probe_path(name)
+    return recording.make_probe_path(name)
 
 
 def read_signal(path: Path, name: str | None) -> PositionSignal:
@@ -86,10 +86,10 @@ def read_signal(path: Path, name: str | None) -> PositionSignal:
         UsSimError: it cannot be read, or shows no motion.
     """
     motion = read_motion(path, name)
-    return signal_of_positions(seconds_of(motion), motion.positions)
+    return compute_position_signal(convert_stamps(motion), motion.positions)
 
 
-def seconds_of(motion: ProbePath) -> NDArray[np.float64]:
+def convert_stamps(motion: ProbePath) -> NDArray[np.float64]:
     """(K,) s, its stamps."""
     return np.asarray(1e-9 * motion.stamps, np.float64)
 
@@ -97,7 +97,7 @@ def seconds_of(motion: ProbePath) -> NDArray[np.float64]:
 _IMAGES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
 
 
-def calibrate_photos(settings: CameraSettings, progress: Progress | None = None) -> str:
+def calibrate_photos(settings: CameraCalibrationSettings, progress: Progress | None = None) -> str:
     """Calibrate a camera and write its info; returns a sentence with the result.
 
     Args:
@@ -157,7 +157,7 @@ def calibrate_photos(settings: CameraSettings, progress: Progress | None = None)
         f"{intrinsic} {found.camera.matrix[k, k]:.1f} ± {found.deviations[k]:.1f}"
         for k, intrinsic in enumerate(INTRINSICS[:2])
     )
-    said = f"{out}: {focal} pixels, RMS {found.rms:.3f} pixels in {counted(len(views), 'photo')}, "
+    said = f"{out}: {focal} pixels, RMS {found.rms:.3f} pixels in {format_count(len(views), 'photo')}, "
     said += f"corners up to {100 * found.reach:.0f} % of the way to the image's"
     if blank:
         said += f"; {len(blank)} without the board: {', '.join(blank)}"
@@ -196,7 +196,7 @@ def _read(photo: Path) -> NDArray[np.uint8]:
 _TABLES = {".csv", ".txt"}
 
 
-def calibrate_tip(settings: PivotSettings, _: Progress | None = None) -> str:
+def calibrate_tip(settings: PivotCalibrationSettings, _: Progress | None = None) -> str:
     """Find a stylus' tip and write it; returns a sentence with the result.
 
     Raises:
@@ -226,7 +226,7 @@ def calibrate_tip(settings: PivotSettings, _: Progress | None = None) -> str:
     )
 
 
-def calibrate_registration(settings: LandmarkSettings, _: Progress | None = None) -> str:
+def calibrate_registration(settings: LandmarkCalibrationSettings, _: Progress | None = None) -> str:
     """Register a device to the patient by landmarks; returns a sentence with the result.
 
     Landmarks on a probe's face, measured in the frame of its marker, likewise give the probe's
@@ -279,7 +279,7 @@ def calibrate_registration(settings: LandmarkSettings, _: Progress | None = None
     )
 
 
-def calibrate_clock(settings: ClockSettings, _: Progress | None = None) -> str:
+def calibrate_clock(settings: ClockCalibrationSettings, _: Progress | None = None) -> str:
     """Find the offset of a device's stamps; returns a sentence with the result.
 
     Raises:
@@ -319,16 +319,16 @@ def _touched(
         )
     motion = read_motion(recording, name)
     offset = read_transform(tip).position
-    tips = np.array([pose.apply(offset) for pose in motion.poses])
+    tips = np.array([pose.transform_points(offset) for pose in motion.poses])
     rotations = np.array([pose.rotation for pose in motion.poses])
-    dwells = find_dwells(seconds_of(motion), tips, rotations)
+    dwells = find_dwells(convert_stamps(motion), tips, rotations)
     if len(dwells) != len(names):
-        start = seconds_of(motion)[0]
+        start = convert_stamps(motion)[0]
         at = ", ".join(f"{dwell.start - start:.0f} s" for dwell in dwells)
-        where = counted(len(dwells), "place") + (f" (at {at})" if at else "")
+        where = format_count(len(dwells), "place") + (f" (at {at})" if at else "")
         raise CalibrationError(
             f"{recording}: the stylus pivoted on {where} where "
-            f"{counted(len(names), 'landmark is', 'landmarks are')} named: touch each for two "
+            f"{format_count(len(names), 'landmark is', 'landmarks are')} named: touch each for two "
             f"seconds in the file's order, tilting the stylus with its tip still"
         )
     places = [dwell.position for dwell in dwells]

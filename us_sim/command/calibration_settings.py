@@ -1,7 +1,7 @@
 """The options of `us-sim calibrate`, each a field of settings.
 
->>> from us_sim.command.calibration_settings import ClockSettings
->>> ClockSettings("tracker.mcap", "arm.mcap", largest="300 ms").largest
+>>> from us_sim.command.calibration_settings import ClockCalibrationSettings
+>>> ClockCalibrationSettings("tracker.mcap", "arm.mcap", largest="300 ms").largest
 0.3
 """
 
@@ -41,15 +41,15 @@ class CalibrationSettings(Settings):
     def check(self) -> None:
         """Refuse to write over a file, which is worth knowing before the work."""
         if self.out.suffix.lower() not in (".yaml", ".yml"):
-            raise self.refused("out", f"{self.out}: must be a file that ends in .yaml")
+            raise self.make_error("out", f"{self.out}: must be a file that ends in .yaml")
         if self.out.exists():
-            raise self.refused("out", f"{self.out}: exists already; choose another name")
+            raise self.make_error("out", f"{self.out}: exists already; choose another name")
         if not self.out.absolute().parent.is_dir():
-            raise self.refused("out", f"{self.out}: there is no {self.out.absolute().parent}")
+            raise self.make_error("out", f"{self.out}: there is no {self.out.absolute().parent}")
 
 
 @dataclass(frozen=True)
-class CameraSettings(CalibrationSettings):
+class CameraCalibrationSettings(CalibrationSettings):
     """Lens and focal length from photos of a board."""
 
     board: Path = setting(description="file of the board, as `us-sim print-marker` prints it")
@@ -59,7 +59,7 @@ class CameraSettings(CalibrationSettings):
 
 
 @dataclass(frozen=True)
-class PivotSettings(CalibrationSettings):
+class PivotCalibrationSettings(CalibrationSettings):
     """A stylus' tip from turning it about the tip."""
 
     recording: Path = setting(description="bag, or tracker recording of Plus")
@@ -68,7 +68,7 @@ class PivotSettings(CalibrationSettings):
 
 
 @dataclass(frozen=True)
-class LandmarkSettings(CalibrationSettings):
+class LandmarkCalibrationSettings(CalibrationSettings):
     """Where the tracker or the probe is, from points touched."""
 
     known: Path = setting(description="landmarks in the patient's frame: CSV name,x,y,z")
@@ -88,7 +88,7 @@ class LandmarkSettings(CalibrationSettings):
 
 
 @dataclass(frozen=True)
-class ClockSettings(CalibrationSettings):
+class ClockCalibrationSettings(CalibrationSettings):
     """Offset of a tracker's clock from one motion."""
 
     moving: Path = setting(description="recording whose stamps are to be mended")

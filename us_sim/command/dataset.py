@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from us_sim.command.options import add_setting_options, read_settings, scene_keys
+from us_sim.command.options import add_setting_options, read_scene_keys, read_settings
 from us_sim.errors import EpisodeError
 
 
@@ -46,4 +46,4 @@ def _dataset(args: argparse.Namespace) -> int:
     from us_sim.environment.dataset import DatasetSettings, make_dataset
 
     settings = read_settings(args, DatasetSettings)
-    return make_dataset(args.scenes, settings, scene_keys(args.set))
+    return make_dataset(args.scenes, settings, read_scene_keys(args.set))

@@ -15,18 +15,18 @@ import yaml
 from us_sim.command.options import (
     add_scene_options,
     add_setting_options,
+    read_scene_name,
     read_settings,
-    scene_name,
 )
 from us_sim.errors import BagError, SceneError
-from us_sim.settings.spelling import aligned
+from us_sim.settings.spelling import align_columns
 from us_sim.share import full_path
 from us_sim.tissue.stiffness_fit import StiffnessSettings
 
 if TYPE_CHECKING:
     from us_sim.scene.scene import Scene
     from us_sim.tissue.elasticity.materials import TissueMaterials
-    from us_sim.tissue.stiffness_fit import Press, StiffnessFit
+    from us_sim.tissue.stiffness_fit import RecordedPress, StiffnessFit
 
 
 def fit_stiffness_options(parser: argparse.ArgumentParser) -> None:
@@ -38,24 +38,24 @@ def fit_stiffness_options(parser: argparse.ArgumentParser) -> None:
 
 def _fit(args: argparse.Namespace) -> int:
     from us_sim.progress import late_progress
-    from us_sim.scene.building import materials_of, tissue_model_of, volume_of
+    from us_sim.scene.building import build_materials, build_tissue_model, load_volume
     from us_sim.scene.reading import load_scene
     from us_sim.tissue.stiffness_fit import fit_stiffness
 
     settings = read_settings(args, StiffnessSettings)
-    name = scene_name(args)
+    name = read_scene_name(args)
     scene = load_scene(name, volume=args.volume)
     section = scene.tissue
     if section is None:
         raise SceneError(f"{scene.origin}: tissue: is missing, so that there is nothing to press")
     press = _read_press(args.session, settings)
-    volume = volume_of(scene)
-    model = tissue_model_of(scene, volume, print)
+    volume = load_volume(scene)
+    model = build_tissue_model(scene, volume, print)
 
     def constants(moduli: Mapping[str, float]) -> TissueMaterials:
         given = section.materials
         made = {name: replace(given[name], young_modulus=moduli[name]) for name in given}
-        return materials_of(scene, made, model.mesh, volume)
+        return build_materials(scene, made, model.mesh, volume)
 
     moduli = {name: material.young_modulus for name, material in section.materials.items()}
     show = late_progress("fit-stiffness")
@@ -67,7 +67,7 @@ def _fit(args: argparse.Namespace) -> int:
     return 0
 
 
-def _read_press(session: Path, settings: StiffnessSettings) -> Press:
+def _read_press(session: Path, settings: StiffnessSettings) -> RecordedPress:
     from us_sim.recording.lerobot_writer import WRENCH_PARTS
     from us_sim.recording.path import read_path
     from us_sim.recording.reader import read_bag
@@ -75,7 +75,7 @@ def _read_press(session: Path, settings: StiffnessSettings) -> Press:
     from us_sim.tissue.stiffness_fit import pair_press
 
     bag = read_bag(session)
-    path = read_path(session, bag.topic(settings.pose).name)
+    path = read_path(session, bag.find_topic(settings.pose).name)
     felt_in, felt = read_wrenches(bag, settings.wrench)
     for topic, frame, expected, option in (
         (path.topic, path.frame_id, "patient", "--pose"),
@@ -104,7 +104,7 @@ def _table(found: StiffnessFit) -> str:
         f"left over (RMS): {force:.3g} N, {1e3 * torque:.3g} mN m at {len(found.depths)} poses "
         f"down to {1e3 * found.depths.max():.1f} mm"
     )
-    return "\n".join([*aligned(rows), left])
+    return "\n".join([*align_columns(rows), left])
 
 
 def _base(asked: str, scene: Scene) -> dict[str, str]:

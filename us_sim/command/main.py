@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, TextIO, cast
 
-from us_sim.errors import UsSimError, printable
+from us_sim.errors import UsSimError, printable_line
 
 if TYPE_CHECKING:
     import argparse
@@ -161,4 +161,4 @@ def _say(sentence: str) -> None:
     progress = sys.modules.get("us_sim.progress")  # which costs time to import
     if progress is not None:
         progress.end_late_bars()
-    print(f"us-sim: {printable(sentence)}", file=sys.stderr)
+    print(f"us-sim: {printable_line(sentence)}", file=sys.stderr)

@@ -11,7 +11,7 @@ from us_sim.command.options import add_setting_options, read_settings
 from us_sim.progress import late_progress
 from us_sim.settings.registry import CALIBRATIONS, EVALUATIONS
 from us_sim.settings.setting import Settings
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import format_count
 
 
 def evaluate_options(parser: argparse.ArgumentParser) -> None:
@@ -29,12 +29,12 @@ def _subject_options(name: str, parser: argparse.ArgumentParser) -> None:
         default=Path(f"us_sim_{name}"),
         help="folder to write to, without a report so far; default: %(default)s",
     )
-    add_setting_options(parser, EVALUATIONS.settings(name))
+    add_setting_options(parser, EVALUATIONS.load_settings(name))
     parser.set_defaults(command=partial(_evaluate, name))
 
 
 def _evaluate(name: str, args: argparse.Namespace) -> int:
-    settings = read_settings(args, EVALUATIONS.settings(name))
+    settings = read_settings(args, EVALUATIONS.load_settings(name))
     more = [] if type(settings) is Settings else [settings]
     return int(EVALUATIONS.load(name)(args.out, args.quick, *more))
 
@@ -42,14 +42,14 @@ def _evaluate(name: str, args: argparse.Namespace) -> int:
 def calibrate_options(parser: argparse.ArgumentParser) -> None:
     calibrations = parser.add_subparsers(required=True, metavar="CALIBRATION")
     for name in CALIBRATIONS:
-        settings = CALIBRATIONS.settings(name)
+        settings = CALIBRATIONS.load_settings(name)
         calibration = calibrations.add_parser(name, help=settings.__doc__)
         add_setting_options(calibration, settings)
         calibration.set_defaults(command=partial(_calibrate, name))
 
 
 def _calibrate(name: str, args: argparse.Namespace) -> int:
-    settings = read_settings(args, CALIBRATIONS.settings(name))
+    settings = read_settings(args, CALIBRATIONS.load_settings(name))
     print(CALIBRATIONS.load(name)(settings, late_progress(f"calibrate {name}")))
     return 0
 
@@ -68,6 +68,6 @@ def _print_marker(args: argparse.Namespace) -> int:
     from us_sim.tracking.camera.rigid_body import read_rigid_body
 
     pages = print_markers(read_rigid_body(args.body), args.out, args.paper)
-    count = counted(len(pages), "sheet")
+    count = format_count(len(pages), "sheet")
     print(f"{args.out}: {pages[0].foot}; {count} of {args.paper}, to be printed at 100 %")
     return 0

@@ -4,11 +4,11 @@ A field of settings without a default is a positional argument, or a required op
 keyword-only; a field with one is an option, and a flag where it is a truth.
 
 >>> import argparse
->>> from us_sim.command.calibration_settings import ClockSettings
+>>> from us_sim.command.calibration_settings import ClockCalibrationSettings
 >>> parser = argparse.ArgumentParser()
->>> add_setting_options(parser, ClockSettings)
+>>> add_setting_options(parser, ClockCalibrationSettings)
 >>> args = parser.parse_args(["a.mcap", "b.mcap", "--largest", "2 min"])
->>> read_settings(args, ClockSettings)
+>>> read_settings(args, ClockCalibrationSettings)
 Traceback (most recent call last):
 ...
 us_sim.errors.CalibrationError: --largest: '2 min' is not a time in s, ms, us or µs
@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
 
 from us_sim.errors import UsSimError
 from us_sim.settings.setting import Settings, kinds_of, rules_of
-from us_sim.settings.spelling import unknown
+from us_sim.settings.spelling import describe_unknown
 from us_sim.share import find_bag
 
 if TYPE_CHECKING:
@@ -53,12 +53,12 @@ class ChosenParser(argparse.ArgumentParser):
         parsed, others = super().parse_known_args(args, namespace)
         for other in others:
             if other.startswith("--"):
-                self.error(unknown(other.partition("=")[0], self._option_string_actions))
+                self.error(describe_unknown(other.partition("=")[0], self._option_string_actions))
         return parsed, others
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
-            raise argparse.ArgumentError(action, unknown(value, map(str, action.choices)))
+            raise argparse.ArgumentError(action, describe_unknown(value, map(str, action.choices)))
 
 
 S = TypeVar("S", bound=Settings)
@@ -165,7 +165,7 @@ def add_path_option(parser: argparse.ArgumentParser, what: str) -> None:
     )
 
 
-def scene_name(args: argparse.Namespace, default: str | None = None) -> str:
+def read_scene_name(args: argparse.Namespace, default: str | None = None) -> str:
     """The scene that is asked for, or ``case:`` and the case.
 
     Raises:
@@ -219,27 +219,27 @@ def add_view_option(parser: argparse.ArgumentParser) -> None:
     add_viewer_options(parser)
 
 
-def viewer(args: argparse.Namespace) -> ViewerSettings:
+def read_viewer_settings(args: argparse.Namespace) -> ViewerSettings:
     """Settings of the viewer; a wrong value raises a UsSimError."""
     from us_sim.settings.viewer import ViewerSettings
 
     return read_settings(args, ViewerSettings, _OF_THE_VIEWER)
 
 
-def viewed(args: argparse.Namespace) -> ViewerSettings | None:
+def read_view_settings(args: argparse.Namespace) -> ViewerSettings | None:
     """Settings of the viewer; None without ``--view``.
 
     Raises:
         UsSimError: a value is wrong, or given without ``--view``.
     """
     if args.view:
-        return viewer(args)
+        return read_viewer_settings(args)
     if any(name in args for name in _OF_THE_VIEWER):
         raise UsSimError("--host, --port and --recordings are the viewer's: add --view")
     return None
 
 
-def node_parameters(texts: Sequence[str]) -> dict[str, dict[str, str]]:
+def read_node_parameters(texts: Sequence[str]) -> dict[str, dict[str, str]]:
     """Values that ``--param`` sets, by name, by node.
 
     Raises:
@@ -257,10 +257,10 @@ def node_parameters(texts: Sequence[str]) -> dict[str, dict[str, str]]:
     return parameters
 
 
-def scene_keys(texts: Sequence[str]) -> dict[str, Any]:
+def read_scene_keys(texts: Sequence[str]) -> dict[str, Any]:
     """Read keys of a scene that ``--set`` changes, as its YAML has them.
 
-    >>> scene_keys(["tissue.solver=fem", "episode.steps=100", "episode.draws={gain: [0, 0]}"])
+    >>> read_scene_keys(["tissue.solver=fem", "episode.steps=100", "episode.draws={gain: [0, 0]}"])
     {'tissue': {'solver': 'fem'}, 'episode': {'steps': 100, 'draws': {'gain': [0, 0]}}}
 
     Raises:

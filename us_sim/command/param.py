@@ -16,7 +16,7 @@ from typing import Any
 
 from us_sim.command.options import add_network_option
 from us_sim.errors import UsSimError
-from us_sim.settings.spelling import unknown
+from us_sim.settings.spelling import describe_unknown
 from us_sim.settings.text_files import YamlError, load_yaml
 
 DISCOVERY_S = 7.0  # to discover a node: Fast DDS may miss an announcement, and repeats it after 3 s
@@ -47,9 +47,9 @@ def _run(command: Callable[[_Asker, argparse.Namespace], int], args: argparse.Na
     from us_sim.run.processes import prepare_ros
 
     prepare_ros(network=args.network)
-    from us_sim.run.domain import ros_context
+    from us_sim.run.domain import make_ros_context
 
-    context = ros_context()
+    context = make_ros_context()
     try:
         with contextlib.closing(_Asker(context)) as asker:
             return command(asker, args)
@@ -58,9 +58,9 @@ def _run(command: Callable[[_Asker, argparse.Namespace], int], args: argparse.Na
 
 
 def _list(asker: _Asker, args: argparse.Namespace) -> int:
-    for node in asker.nodes() if args.node is None else [asker.find(args.node)]:
+    for node in asker.discover_nodes() if args.node is None else [asker.find_node(args.node)]:
         try:
-            names = [f"  {name}" for name in asker.names(node)]
+            names = [f"  {name}" for name in asker.list_parameters(node)]
         except UsSimError as error:
             if args.node is not None:
                 raise
@@ -73,8 +73,8 @@ def _list(asker: _Asker, args: argparse.Namespace) -> int:
 def _get(asker: _Asker, args: argparse.Namespace) -> int:
     from rclpy.parameter import parameter_value_to_python
 
-    node = asker.find(args.node)
-    values = asker.ask(node, "get_parameters", [args.name]).values
+    node = asker.find_node(args.node)
+    values = asker.ask_node(node, "get_parameters", [args.name]).values
     if not values:
         asker.refuse_unknown(node, args.name)
         raise UsSimError(f"{args.name} of {node} is not set")
@@ -88,9 +88,9 @@ def _set(asker: _Asker, args: argparse.Namespace) -> int:
     value: Any = None
     with contextlib.suppress(YamlError):  # a text with a colon, say
         value = load_yaml(args.value)
-    node = asker.find(args.node)
+    node = asker.find_node(args.node)
     is_text = value is None or isinstance(value, dict)
-    result = asker.set(node, args.name, args.value if is_text else value)
+    result = asker.set_parameter(node, args.name, args.value if is_text else value)
     reason = f": {result.reason}" if result.reason else ""
     if not result.successful:
         asker.refuse_unknown(node, args.name)
@@ -120,7 +120,7 @@ class _Asker:
         self._executor.shutdown()
         self._node.destroy_node()
 
-    def nodes(self, wanted: str = "", seconds: float = ALL_S) -> list[str]:
+    def discover_nodes(self, wanted: str = "", seconds: float = ALL_S) -> list[str]:
         """Look for nodes until the time is over, or the wanted one is there.
 
         Returns:
@@ -134,20 +134,20 @@ class _Asker:
                 return seen
             self._executor.spin_once(timeout_sec=0.05)
 
-    def find(self, name: str) -> str:
+    def find_node(self, name: str) -> str:
         """Return the full name of a node; raise UsSimError when it is not discovered."""
         full = name if name.startswith("/") else f"/{name}"
-        seen = self.nodes(full, DISCOVERY_S)
+        seen = self.discover_nodes(full, DISCOVERY_S)
         if full in seen:
             return full
         domain = self._node.context.get_domain_id()
         nobody = f"{full}; there is no node on ROS domain {domain}, as far as can be seen from here"
-        raise UsSimError(f"node not found: {unknown(full, seen) if seen else nobody}")
+        raise UsSimError(f"node not found: {describe_unknown(full, seen) if seen else nobody}")
 
-    def names(self, node: str) -> list[str]:
-        return sorted(self.ask(node, "list_parameters").result.names)
+    def list_parameters(self, node: str) -> list[str]:
+        return sorted(self.ask_node(node, "list_parameters").result.names)
 
-    def set(self, node: str, name: str, value: Any) -> Any:
+    def set_parameter(self, node: str, name: str, value: Any) -> Any:
         """Set a parameter; a value for which ROS has no type is a text."""
         from rclpy.parameter import Parameter
 
@@ -155,9 +155,9 @@ class _Asker:
             parameter = Parameter(name, value=value)
         except (TypeError, ValueError):  # a mapping, or a list of several types
             parameter = Parameter(name, value=str(value))
-        return self.ask(node, "set_parameters", [parameter]).results[0]
+        return self.ask_node(node, "set_parameters", [parameter]).results[0]
 
-    def ask(self, node: str, request: str, *arguments: Any) -> Any:
+    def ask_node(self, node: str, request: str, *arguments: Any) -> Any:
         """Return a node's answer; raise UsSimError when none comes."""
         from rclpy.parameter_client import AsyncParameterClient
 
@@ -172,6 +172,6 @@ class _Asker:
 
     def refuse_unknown(self, node: str, name: str) -> None:
         """Raise UsSimError when a node has no parameter of that name."""
-        known = self.names(node)
+        known = self.list_parameters(node)
         if name not in known:
-            raise UsSimError(f"{node} has no such parameter: {unknown(name, known)}")
+            raise UsSimError(f"{node} has no such parameter: {describe_unknown(name, known)}")

@@ -13,8 +13,8 @@ import numpy as np
 from us_sim.command.options import (
     add_scene_options,
     add_setting_options,
+    read_scene_name,
     read_settings,
-    scene_name,
 )
 from us_sim.errors import SceneError, SolverError
 from us_sim.settings.quantity import Quantity
@@ -51,12 +51,12 @@ class PressSettings(Settings):
     def check(self) -> None:
         """Refuse files that exist, before the work."""
         if self.out.suffix.lower() != ".csv":
-            raise self.refused("out", f"{self.out}: must be a file that ends in .csv")
+            raise self.make_error("out", f"{self.out}: must be a file that ends in .csv")
         for file in (self.out, self.out.with_suffix(".png")):
             if file.exists():
-                raise self.refused("out", f"{file}: exists already; choose another name")
+                raise self.make_error("out", f"{file}: exists already; choose another name")
         if not self.out.absolute().parent.is_dir():
-            raise self.refused("out", f"{self.out}: there is no {self.out.absolute().parent}")
+            raise self.make_error("out", f"{self.out}: there is no {self.out.absolute().parent}")
 
 
 def press_options(parser: argparse.ArgumentParser) -> None:
@@ -69,18 +69,18 @@ def press_options(parser: argparse.ArgumentParser) -> None:
 def _press(args: argparse.Namespace) -> int:
     from us_sim.geometry.pose import Pose
     from us_sim.progress import late_progress
-    from us_sim.scene.building import label_fractions_of, tissue_model_of, volume_of
+    from us_sim.scene.building import build_tissue_model, compute_label_fractions, load_volume
     from us_sim.scene.reading import load_scene
     from us_sim.tissue.press import press_to_force
     from us_sim.tissue.solvers.solver import create_solver
 
     settings = read_settings(args, PressSettings)
-    scene = load_scene(scene_name(args), volume=args.volume)
+    scene = load_scene(read_scene_name(args), volume=args.volume)
     section = scene.tissue
     if section is None:
         raise SceneError(f"{scene.origin}: tissue: is missing, so that there is nothing to press")
-    volume = volume_of(scene)
-    model = tissue_model_of(scene, volume, print)
+    volume = load_volume(scene)
+    model = build_tissue_model(scene, volume, print)
     name = args.solver or section.solver
     chosen: Any = section.settings.get(name)
     solver = create_solver(name, model, chosen)
@@ -95,7 +95,7 @@ def _press(args: argparse.Namespace) -> int:
         progress=show,
     )
     show(1.0, f"{1e3 * curve[-1].depth:.2f} mm deep")
-    fractions, names = label_fractions_of(model.mesh, volume), volume.label_names
+    fractions, names = compute_label_fractions(model.mesh, volume), volume.label_names
     table = _table(model.mesh, curve, fractions, {0: "tissue"} | dict(names))
     with settings.out.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([list(table), *zip(*table.values(), strict=True)])
@@ -122,7 +122,7 @@ def _table(
     }
     parts = {names[0]: np.ones(len(mesh.tetrahedra))}
     if fractions is not None:
-        parts = {names[int(label)]: fractions.of(int(label)) for label in fractions.labels}
+        parts = {names[int(label)]: fractions.for_label(int(label)) for label in fractions.labels}
     strains = [
         100 * strains_along(mesh, press.deformation.nodes, press.pose.rotation[:, 2])
         for press in curve

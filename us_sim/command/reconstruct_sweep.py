@@ -19,12 +19,12 @@ from us_sim.volume.reconstruction.calibration_file import SweepCalibration, read
 from us_sim.volume.reconstruction.reconstruction import (
     Progress,
     Rest,
-    plan,
+    plan_insertion,
     reconstruct,
 )
-from us_sim.volume.reconstruction.scanning_probe import scanning_probe
+from us_sim.volume.reconstruction.scanning_probe import find_scanning_probe
 from us_sim.volume.reconstruction.settings import Compounding, ImagePart
-from us_sim.volume.sequences.sweep import Sweep, read_sweep
+from us_sim.volume.sequences.sweep import TrackedSweep, read_sweep
 
 
 @dataclass(frozen=True)
@@ -50,15 +50,15 @@ class SweepSettings(Settings):
         """Refuse a place that cannot be written to, which is worth knowing before the work."""
         for path in (self.out, self.picture):
             if path.exists():
-                raise self.refused("out", f"{path}: exists already; choose another name")
+                raise self.make_error("out", f"{path}: exists already; choose another name")
         if not self.is_volume and 1 < len(self.out.suffix) <= 5:
-            raise self.refused(
+            raise self.make_error(
                 "out",
                 f"{self.out}: its name ends as no volume's does; write "
                 f"{', '.join(VOLUME_ENDINGS)}, or a folder's name without an ending for a case",
             )
         if self.is_volume and not self.out.absolute().parent.is_dir():
-            raise self.refused("out", f"{self.out}: there is no {self.out.absolute().parent}")
+            raise self.make_error("out", f"{self.out}: there is no {self.out.absolute().parent}")
 
     @property
     def is_volume(self) -> bool:
@@ -81,7 +81,7 @@ def reconstruct_sweep(
     compounding: Compounding,
     part: ImagePart,
     *,
-    rest_of: Callable[[Sweep, ImagePart], Rest] | None = None,
+    rest_of: Callable[[TrackedSweep, ImagePart], Rest] | None = None,
     progress: Progress | None = None,
 ) -> str:
     """Reconstruct a sweep and write the result; returns a sentence about it.
@@ -107,9 +107,9 @@ def reconstruct_sweep(
         calibration=calibration.transforms,
     )
     rest = None if rest_of is None else rest_of(sweep, part)
-    planned = plan(sweep, compounding, part, rest)
+    planned = plan_insertion(sweep, compounding, part, rest)
     made = reconstruct(planned, progress=progress)
-    scanner = None if settings.is_volume else scanning_probe(sweep, part, planned.used)
+    scanner = None if settings.is_volume else find_scanning_probe(sweep, part, planned.used)
     shape = " × ".join(map(str, made.volume.shape))
     size = f"{shape} voxels of {1e3 * planned.grid.spacing:.4g} mm"
     picture = settings.picture

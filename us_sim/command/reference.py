@@ -13,16 +13,16 @@ from pathlib import Path
 from us_sim.errors import UsSimError
 from us_sim.settings.registry import PROBES
 from us_sim.settings.setting import Settings, kinds_of, rules_of
-from us_sim.settings.spelling import nearest, unknown
+from us_sim.settings.spelling import describe_unknown, find_closest
 from us_sim.settings.tables import (
     Section,
-    anchor,
-    default_text,
-    first_sentence,
-    markdown,
-    sections_of,
-    table,
-    values,
+    describe_default,
+    describe_values,
+    extract_summary,
+    format_table,
+    make_anchor,
+    make_sections,
+    tabulate_settings,
 )
 
 INTRODUCTION = """\
@@ -90,7 +90,7 @@ def reference_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _reference(args: argparse.Namespace) -> int:
-    text = reference_page() if args.part is None else _part(args.part)
+    text = write_reference_page() if args.part is None else _part(args.part)
     if args.out is None:
         print(text, end="")
     else:
@@ -98,12 +98,12 @@ def _reference(args: argparse.Namespace) -> int:
     return 0
 
 
-def reference_page() -> str:
+def write_reference_page() -> str:
     """Write the whole page."""
-    return f"{INTRODUCTION}\n{_written(reference_sections())}"
+    return f"{INTRODUCTION}\n{_written(make_reference_sections())}"
 
 
-def reference_sections() -> Iterator[tuple[int, Section]]:
+def make_reference_sections() -> Iterator[tuple[int, Section]]:
     """Make all sections in order, each with the level of its heading."""
     from us_sim.geometry.pose import Placement
     from us_sim.scene.scene import Scene
@@ -112,8 +112,13 @@ def reference_sections() -> Iterator[tuple[int, Section]]:
     yield 2, Section("parameters", "Node parameters", PARAMETERS_TEXT)
     yield from ((3, section) for section in _nodes())
     yield 2, Section("scene", "Scene settings", SCENE_TEXT)
-    yield from ((3, section) for section in sections_of(Scene, "", {Placement: POSE}))
-    yield 3, Section("pose", POSE, f"{first_sentence(Placement.__doc__)}\n\n{table(Placement)}")
+    yield from ((3, section) for section in make_sections(Scene, "", {Placement: POSE}))
+    yield (
+        3,
+        Section(
+            "pose", POSE, f"{extract_summary(Placement.__doc__)}\n\n{tabulate_settings(Placement)}"
+        ),
+    )
 
 
 def _part(name: str) -> str:
@@ -122,15 +127,15 @@ def _part(name: str) -> str:
     Raises:
         UsSimError: there are none of that name.
     """
-    sections = list(reference_sections())
+    sections = list(make_reference_sections())
     found = [each for each in sections if f"{each[1].path}.".startswith(f"{name}.")]
     # Or what stands within another, such as a solver or a kind of probe.
     found = found or [each for each in sections if f".{name}." in f"{each[1].path}."]
     if not found:
         known = [section.path for _, section in sections if section.path]
-        if nearest(name, known) is None:
+        if find_closest(name, known) is None:
             known = list(dict.fromkeys(path.split(".")[0] for path in known))
-        raise UsSimError(f"reference: {unknown(name, known)}")
+        raise UsSimError(f"reference: {describe_unknown(name, known)}")
     return _written(found)
 
 
@@ -145,7 +150,7 @@ def _topics() -> str:
     rows = []
     for topic in TOPICS:
         sources = _names(topic.publishers)
-        if topic.from_drivers:
+        if topic.is_from_drivers:
             sources = f"a driver, {sources}" if sources else "a driver"
         elif len(topic.publishers) > len(NODES) / 2:
             silent = [node for node in NODES if node not in topic.publishers]
@@ -153,7 +158,7 @@ def _topics() -> str:
         kind = f"{topic.type_name}{' (latched)' if topic.latched else ''}"
         heard = _names(topic.subscribers)
         rows.append((f"`{topic.name}`", kind, sources, heard, topic.description))
-    return markdown(("topic", "type", "from", "to", "what it carries"), rows)
+    return format_table(("topic", "type", "from", "to", "what it carries"), rows)
 
 
 def _names(names: Iterable[str]) -> str:
@@ -170,18 +175,18 @@ def _nodes() -> Iterator[Section]:
     for node, settings in NODES.items():
         text = []
         if SceneNodeSettings in settings:
-            text.append(f"Those of [every node that works on a scene](#{anchor(common)}).")
+            text.append(f"Those of [every node that works on a scene](#{make_anchor(common)}).")
         for each in settings:
             if each is Imaging:
                 text.append(
                     f"The keys of [imaging](#imaging), and {_of_probe()} of the [probe](#probe)."
                 )
             elif each is not SceneNodeSettings:
-                about = first_sentence(each.__doc__)
+                about = extract_summary(each.__doc__)
                 text += [about] * (about != f"Of `{node}`.") + [_parameters(each)]
         if node in _OF_THE_SCENE:
             keys = _OF_THE_SCENE[node].items()
-            links = ", ".join(f"{key} of [{title}](#{anchor(title)})" for key, title in keys)
+            links = ", ".join(f"{key} of [{title}](#{make_anchor(title)})" for key, title in keys)
             text.append(f"While running, with the scene's defaults, where it names them: {links}.")
         yield Section(node, node, "\n\n".join(text))
 
@@ -190,7 +195,7 @@ def _of_probe() -> str:
     """Names of the settings that every kind of probe lets change while images are made."""
     from us_sim.nodes.settings import is_live
 
-    kinds = [PROBES.settings(name) for name in PROBES]
+    kinds = [PROBES.load_settings(name) for name in PROBES]
     live = [{name for name in rules_of(kind) if is_live(kind, name)} for kind in kinds]
     return _names(sorted(set.intersection(*live)))
 
@@ -203,11 +208,11 @@ def _parameters(settings: type[Settings]) -> str:
     rows = [
         (
             f"`{name}`",
-            values(kinds[name], rule),
-            default_text(settings, name),
+            describe_values(kinds[name], rule),
+            describe_default(settings, name),
             "yes" if is_live(settings, name) else "",
             rule.description,
         )
         for name, rule in rules_of(settings).items()
     ]
-    return markdown(("parameter", "value", "default", "while running", "what it is"), rows)
+    return format_table(("parameter", "value", "default", "while running", "what it is"), rows)

@@ -12,7 +12,7 @@ from us_sim.command.options import add_setting_options, read_settings
 from us_sim.errors import ScoreError
 from us_sim.progress import late_progress
 from us_sim.scoring.exercise import Exercise, Step, read_exercise
-from us_sim.scoring.metrics import metrics_of
+from us_sim.scoring.metrics import compute_metrics
 from us_sim.scoring.picture import draw_score
 from us_sim.scoring.settings import ScoreSettings
 from us_sim.share import find_bag
@@ -53,19 +53,19 @@ def _require_new(out: Path | None, files: Sequence[str]) -> None:
 
 
 def _score_class(args: argparse.Namespace) -> int:
-    from us_sim.scoring.class_table import CLASS_FILES, class_table, write_class
+    from us_sim.scoring.class_table import CLASS_FILES, tabulate_results, write_class_table
     from us_sim.scoring.result_place import read_results
 
     _require_new(args.out, CLASS_FILES)
-    table = class_table(read_results(args.of_class))
+    table = tabulate_results(read_results(args.of_class))
     print(table.drop(columns=["volume", "changed", "checksum"]).to_string(index=False))
-    for file in write_class(table, args.out) if args.out is not None else []:
+    for file in write_class_table(table, args.out) if args.out is not None else []:
         print(file)
     return 0
 
 
 def _score(args: argparse.Namespace) -> int:
-    from us_sim.evaluation.report import markdown_table
+    from us_sim.evaluation.report import format_markdown_table
     from us_sim.run.session_score import read_scan
 
     if (args.session is None) == (args.of_class is None):
@@ -77,11 +77,11 @@ def _score(args: argparse.Namespace) -> int:
     out: Path | None = args.out
     _require_new(out, _FILES)
     scan = read_scan(args.session, args.topic, args.wrench, late_progress("score"))
-    metrics = list(metrics_of(scan, settings))
+    metrics = list(compute_metrics(scan, settings))
     rows = [(each.name, each.text, each.unit, each.roles) for each in metrics]
-    table = markdown_table(("metric", "value", "unit", "roles"), rows)
+    table = format_markdown_table(("metric", "value", "unit", "roles"), rows)
     missing = [f"left out: {sentence}" for sentence in scan.missing]
-    steps = exercise.steps(scan) if exercise is not None else []
+    steps = exercise.evaluate_scan(scan) if exercise is not None else []
     done = _exercise_table(exercise, steps) if exercise is not None else ""
     print("\n".join(filter(None, [table, *missing, done])))
     if out is None:
@@ -107,10 +107,10 @@ def _score(args: argparse.Namespace) -> int:
 
 def _exercise_table(exercise: Exercise, steps: Sequence[Step]) -> str:
     """Steps of the exercise, whether each is done, what was seen of it; then the result."""
-    from us_sim.evaluation.report import markdown_table
+    from us_sim.evaluation.report import format_markdown_table
 
     rows = [(each.what, "yes" if each.is_done else "no", each.seen) for each in steps]
-    table = markdown_table((exercise.name, "done", "seen"), rows)
+    table = format_markdown_table((exercise.name, "done", "seen"), rows)
     done = sum(each.is_done for each in steps)
     result = "passed" if done == len(steps) else "not passed"
     return f"{table}\n\n{result}: {done} of {len(steps)} done"

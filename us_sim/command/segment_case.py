@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from us_sim.errors import CaseError, VolumeError
-from us_sim.settings.spelling import aligned
+from us_sim.settings.spelling import align_columns
 from us_sim.share import shared_roots
 from us_sim.volume.cases.case import LABELS, SURFACES, VOLUME, read_case
-from us_sim.volume.cases.proposal import with_proposal
+from us_sim.volume.cases.proposal import complete_settings
 from us_sim.volume.cases.settings import RESERVED, CaseSettings, CaseStructure
 from us_sim.volume.cases.writing import write_case_settings
 from us_sim.volume.files.labels import read_labels
@@ -25,9 +25,9 @@ from us_sim.volume.files.readers import read_volume
 from us_sim.volume.files.writing import write_labels
 from us_sim.volume.partial_file import partial_file
 from us_sim.volume.segmentation.settings import SegmentRequest, read_seeds
-from us_sim.volume.segmentation.structures import segment
-from us_sim.volume.structure_names import anatomical_colour
-from us_sim.volume.surfaces.label_surface import label_surface, write_stl
+from us_sim.volume.segmentation.structures import segment_volume
+from us_sim.volume.structure_names import choose_colour
+from us_sim.volume.surfaces.label_surface import make_label_surface, write_stl
 from us_sim.volume.volume import LabelMap, Volume
 
 PICTURE = "segmentation.png"
@@ -36,7 +36,7 @@ _HEADING = ("structure", "volume", "triangles")
 Progress = Callable[[float, str], None]
 
 
-def segment_as_asked(asked: SegmentRequest, progress: Progress = lambda *_: None) -> str:
+def run_segmentation(asked: SegmentRequest, progress: Progress = lambda *_: None) -> str:
     """Segment a case; return the result in lines for a person.
 
     Raises:
@@ -49,15 +49,15 @@ def segment_as_asked(asked: SegmentRequest, progress: Progress = lambda *_: None
 
     case = read_case(asked.case)
     progress(0.0, "reading")
-    volume = case.volume() if _keeps_labels(asked) else read_volume(case.folder / VOLUME)
+    volume = case.read_volume() if _keeps_labels(asked) else read_volume(case.folder / VOLUME)
     labels = _labels(asked, volume, progress)
-    volume, remarks = labels.on(volume), list(labels.remarks)
+    volume, remarks = labels.apply_to(volume), list(labels.remarks)
     settings = _with_structures(case.settings, labels, remarks)
     surfaces = {}
     for number, (label, name) in enumerate(sorted(labels.names.items())):
         progress(0.8 + 0.1 * number / len(labels.names), f"surface of {name}")
-        surfaces[name] = label_surface(volume, label)
-    settings, folder = with_proposal(settings, volume), case.folder
+        surfaces[name] = make_label_surface(volume, label)
+    settings, folder = complete_settings(settings, volume), case.folder
     with partial_file(folder / PICTURE, PICTURE) as partial:
         draw_segmentation(volume, labels, partial)
     if not _keeps_labels(asked):
@@ -74,7 +74,7 @@ def segment_as_asked(asked: SegmentRequest, progress: Progress = lambda *_: None
         for name, (_, triangles) in surfaces.items()
     ]
     notes = (f"note: {remark}" for remark in remarks)
-    return "\n".join([*aligned(rows), *notes, f"written to {asked.case}"])
+    return "\n".join([*align_columns(rows), *notes, f"written to {asked.case}"])
 
 
 def _keeps_labels(asked: SegmentRequest) -> bool:
@@ -87,7 +87,7 @@ def _labels(asked: SegmentRequest, volume: Volume, progress: Progress) -> LabelM
         return read_labels(asked.labels, volume, names=asked.given_names(), taken=RESERVED)
     if asked.seeds is not None:
         seeds = read_seeds(_seeds_file(asked.seeds))
-        return segment(volume, seeds, lambda done, part: progress(0.1 + 0.7 * done, part))
+        return segment_volume(volume, seeds, lambda done, part: progress(0.1 + 0.7 * done, part))
     names = {label: name for label, name in volume.label_names.items() if label}
     if volume.labels is None or not names:
         raise VolumeError(f"{asked.case}: has no labels yet: give --labels or --seeds")
@@ -115,7 +115,7 @@ def _with_structures(settings: CaseSettings, labels: LabelMap, remarks: list[str
     structures = {}
     for label, name in labels.names.items():
         before = settings.structures.get(name)
-        colour = labels.colours[label] if labels.colours[label] != anatomical_colour(name) else None
+        colour = labels.colours[label] if labels.colours[label] != choose_colour(name) else None
         material = before.material if before is not None else None
         structures[name] = CaseStructure(label=label, material=material, colour=colour)
     gone = [name for name in settings.structures if name not in structures]

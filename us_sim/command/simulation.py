@@ -16,11 +16,11 @@ from us_sim.command.options import (
     add_setting_options,
     add_view_option,
     add_viewer_options,
-    node_parameters,
+    read_node_parameters,
+    read_scene_name,
     read_settings,
-    scene_name,
-    viewed,
-    viewer,
+    read_view_settings,
+    read_viewer_settings,
 )
 from us_sim.errors import UsSimError
 from us_sim.run.processes import begin_fork_server, prepare_ros
@@ -29,7 +29,7 @@ from us_sim.settings.setting import Settings, setting
 from us_sim.share import find_bag, full_path
 
 if TYPE_CHECKING:
-    from us_sim.run.plan import Request
+    from us_sim.run.plan import RunRequest
     from us_sim.run.supervision import SupervisionSettings
 
 
@@ -50,21 +50,21 @@ def demo_options(demo: argparse.ArgumentParser) -> None:
 
 def _demo(args: argparse.Namespace) -> int:
     begin_fork_server()
-    from us_sim.run.live import demo
+    from us_sim.run.live import run_demo
 
-    request = _request(args, "upper_arm", view=viewed(args))
+    request = _request(args, "upper_arm", view=read_view_settings(args))
     prepare_ros(network=args.network)
-    return demo(request, args.out, _supervision(args))
+    return run_demo(request, args.out, _supervision(args))
 
 
-def _request(args: argparse.Namespace, default: str | None = None, **more: Any) -> Request:
+def _request(args: argparse.Namespace, default: str | None = None, **more: Any) -> RunRequest:
     """Return the scene that is asked for, what is played in it, and more of a request."""
-    parameters = node_parameters(args.param)
-    from us_sim.run.plan import Request
+    parameters = read_node_parameters(args.param)
+    from us_sim.run.plan import RunRequest
     from us_sim.scene.reading import load_scene
 
-    scene = load_scene(scene_name(args, default), volume=args.volume)
-    return Request(scene, parameters, path=args.path, topic=args.topic, **more)
+    scene = load_scene(read_scene_name(args, default), volume=args.volume)
+    return RunRequest(scene, parameters, path=args.path, topic=args.topic, **more)
 
 
 def _supervision(args: argparse.Namespace) -> SupervisionSettings:
@@ -94,21 +94,23 @@ def _run(args: argparse.Namespace) -> int:
     asked = read_settings(args, RunSettings)
     if not args.dry_run:
         begin_fork_server()
-    from us_sim.run.live import dry_run, run
+    from us_sim.run.live import dry_run, run_scene
     from us_sim.scene.reading import check_files
 
-    request = _request(args, record=asked.record, duration=asked.duration, view=viewed(args))
+    request = _request(
+        args, record=asked.record, duration=asked.duration, view=read_view_settings(args)
+    )
     if not args.dry_run:
         prepare_ros(network=args.network)
-        return run(request, _supervision(args))
+        return run_scene(request, _supervision(args))
     scene = request.scene
     checked = check_files(scene)
     path = args.path or (Path(scene.path) if scene.path else None)
     if path is not None and not scene.volume.phantom:
-        from us_sim.scene.building import volume_of
+        from us_sim.scene.building import load_volume
         from us_sim.scene.placement import check_path_in_volume
 
-        check_path_in_volume(scene, path, volume_of(scene), args.topic if args.path else None)
+        check_path_in_volume(scene, path, load_volume(scene), args.topic if args.path else None)
     print(dry_run(request))
     if checked:
         print(f"readable  {', '.join(checked)}")
@@ -129,9 +131,9 @@ def render_options(render: argparse.ArgumentParser) -> None:
 
 
 def _render(args: argparse.Namespace) -> int:
-    from us_sim.run.lockstep import render
+    from us_sim.run.lockstep import render_scene
 
-    return render(_request(args), args.out, truth=args.truth)
+    return render_scene(_request(args), args.out, truth=args.truth)
 
 
 def view_options(parser: argparse.ArgumentParser) -> None:
@@ -164,7 +166,7 @@ def _view(args: argparse.Namespace) -> int:
     supervision = _supervision(args)
     if not args.attach:
         begin_fork_server()
-    from us_sim.run.live import run, view_running
+    from us_sim.run.live import run_scene, view_running
 
     if args.attach:
         given = ("scene", "case", "volume", "path", "tracker", "record")
@@ -173,23 +175,23 @@ def _view(args: argparse.Namespace) -> int:
                 "--attach shows what runs already: leave out the scene, --case, --volume, --path, "
                 "--record and --tracker, or leave out --attach"
             )
-        parameters = node_parameters(args.param)
+        parameters = read_node_parameters(args.param)
         prepare_ros(network=args.network)
-        return view_running(viewer(args), parameters, supervision)
+        return view_running(read_viewer_settings(args), parameters, supervision)
     if args.loop and args.path is None:
         raise UsSimError("--loop plays a path again and again: name one with --path")
     request = _request(
         args,
         "upper_arm",
         record=read_settings(args, RunSettings, ("record",)).record,
-        view=viewer(args),
+        view=read_viewer_settings(args),
         by_hand=not args.tracker,
         student=args.student,
         results=_results_address(args),
         playing={"stay": True, "loop": args.loop} if args.path is not None else {},
     )
     prepare_ros(network=args.network)
-    return run(request, supervision)
+    return run_scene(request, supervision)
 
 
 def _results_address(args: argparse.Namespace) -> str | None:
@@ -237,11 +239,11 @@ def play_options(parser: argparse.ArgumentParser) -> None:
 
 def _play(args: argparse.Namespace) -> int:
     from us_sim.nodes.settings import PlayerSettings
-    from us_sim.run.live import play
+    from us_sim.run.live import play_bag
 
     player = read_settings(args, PlayerSettings, (*_OF_THE_PLAYER, "clock"))
     prepare_ros(network=args.network)
-    return play(
+    return play_bag(
         args.bag,
         player,
         topic=args.topic,

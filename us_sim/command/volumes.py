@@ -37,20 +37,20 @@ def import_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _import(args: argparse.Namespace) -> int:
-    from us_sim.volume.deidentification.importing import look_at
+    from us_sim.volume.deidentification.importing import plan_import
     from us_sim.volume.deidentification.settings import ImportSettings
 
     if args.out is None and args.picture is None:
         raise UsSimError(
             "say where to with --out CASE|FILE, or --picture to see what would be done"
         )
-    found = look_at(args.files, args.out, read_settings(args, ImportSettings))
+    found = plan_import(args.files, args.out, read_settings(args, ImportSettings))
     if args.picture is not None:  # before what is refused: it shows what to say
         found.draw(args.picture)
         print(f"{args.picture}: may show a name")
     if args.out is not None:
         found.write(late_progress("import"))
-    print(f"{args.out or args.picture}: {found.said}")
+    print(f"{args.out or args.picture}: {found.summary}")
     return 0
 
 
@@ -77,10 +77,10 @@ def _reconstruct(args: argparse.Namespace) -> int:
     compounding, part = read_settings(args, Compounding), read_settings(args, ImagePart)
     rest_of = None
     if args.undo_pressure is not None:
-        from us_sim.scene.placement import rest_placement
+        from us_sim.scene.placement import build_rest_placement
         from us_sim.scene.reading import load_scene
 
-        rest_of = partial(rest_placement, load_scene(args.undo_pressure))
+        rest_of = partial(build_rest_placement, load_scene(args.undo_pressure))
 
     progress = late_progress(f"reconstruct {Path(settings.sweep).name}")
     print(reconstruct_sweep(settings, compounding, part, rest_of=rest_of, progress=progress))
@@ -95,10 +95,10 @@ def segment_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _segment(args: argparse.Namespace) -> int:
-    from us_sim.command.segment_case import segment_as_asked
+    from us_sim.command.segment_case import run_segmentation
     from us_sim.volume.segmentation.settings import SegmentRequest
 
-    print(segment_as_asked(read_settings(args, SegmentRequest), late_progress("segment")))
+    print(run_segmentation(read_settings(args, SegmentRequest), late_progress("segment")))
     return 0
 
 
@@ -115,14 +115,14 @@ def cases_options(cases: argparse.ArgumentParser) -> None:
 
 
 def _cases(args: argparse.Namespace) -> int:
-    from us_sim.volume.cases.case import case_roots, cases_in, listed, table
+    from us_sim.volume.cases.case import find_cases, format_cases, list_case, list_case_roots
 
-    roots = args.folders or [root for root in case_roots() if root.is_dir()]
-    folders = [folder for root in roots for folder in cases_in(root)]
+    roots = args.folders or [root for root in list_case_roots() if root.is_dir()]
+    folders = [folder for root in roots for folder in find_cases(root)]
     if not folders:
-        where = ", ".join(map(str, args.folders or case_roots()))
+        where = ", ".join(map(str, args.folders or list_case_roots()))
         print(f"no case in {where}; `us-sim import` and `us-sim reconstruct` make one")
         return 0
-    rows = [listed(folder) for folder in folders]
-    print(table(rows))
+    rows = [list_case(folder) for folder in folders]
+    print(format_cases(rows))
     return 1 if any(row.problem for row in rows) else 0

@@ -4,10 +4,10 @@
 the image's middle, presses until it is gone, and lets go.
 
 >>> import numpy as np
->>> from us_sim.environment.agents import dark_spots
+>>> from us_sim.environment.agents import find_dark_spots
 >>> image = np.full((60, 80), 120, np.uint8)
 >>> image[20:32, 30:50] = 5
->>> [spot.centre for spot in dark_spots(image)]
+>>> [spot.centre for spot in find_dark_spots(image)]
 [(39.5, 25.5)]
 """
 
@@ -38,7 +38,7 @@ class Spot:
     area: int  # pixels
 
 
-def dark_pixels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def find_dark_pixels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """(rows, columns) 1 where it is dark for tissue; all 0 in air."""
     smooth = cv2.GaussianBlur(image, (0, 0), max(image.shape) / 128)
     lit = smooth[smooth > 4]
@@ -47,10 +47,10 @@ def dark_pixels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return (smooth < _DARK * np.median(lit)).astype(np.uint8)
 
 
-def dark_spots(image: NDArray[np.uint8]) -> list[Spot]:
+def find_dark_spots(image: NDArray[np.uint8]) -> list[Spot]:
     """Dark spots the size of vessels that do not touch the image's border, the largest first."""
     rows, columns = image.shape
-    _, _, stats, centres = cv2.connectedComponentsWithStats(dark_pixels(image))
+    _, _, stats, centres = cv2.connectedComponentsWithStats(find_dark_pixels(image))
     found = []
     for (left, top, width, height, area), centre in zip(stats[1:], centres[1:], strict=True):
         inside = left > 0 and top > 0 and left + width < columns and top + height < rows
@@ -80,12 +80,12 @@ class VisualServo:
     def act(self, observation: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
         """(6,) the next action."""
         image = np.squeeze(observation["image"])
-        spots = dark_spots(image)
+        spots = find_dark_spots(image)
         x, z = getattr(self, f"_{self.phase}")(image, spots)
         self._steps += 1
         return np.array([x, 0.0, z, 0.0, 0.0, 0.0], np.float32).clip(-1.0, 1.0)
 
-    def _to(self, phase: str) -> tuple[float, float]:
+    def _enter_phase(self, phase: str) -> tuple[float, float]:
         self.phase, self._steps = phase, 0
         return 0.0, 0.0
 
@@ -94,44 +94,44 @@ class VisualServo:
         rows = len(image)
         depths = image[int(0.45 * rows) : int(0.6 * rows)].mean(axis=0)
         touches = (depths > 10.0).mean() > 0.85
-        return self._to("centre") if touches or self._steps > 80 else (0.0, 0.25)
+        return self._enter_phase("centre") if touches or self._steps > 80 else (0.0, 0.25)
 
     def _centre(self, image: NDArray[np.uint8], spots: list[Spot]) -> tuple[float, float]:
         """Bring the largest spot to the middle; slide to and fro where there is none."""
         columns = image.shape[1]
-        spot = self._same(spots) or (spots[0] if spots else None)
+        spot = self._find_followed_spot(spots) or (spots[0] if spots else None)
         if spot is None:
             return 0.6 * math.copysign(1.0, math.sin(self._steps / 25)), 0.0
         self._last = spot
         offset = (spot.centre[0] - (columns - 1) / 2) / columns
         if abs(offset) < 0.02 and self._press and self._steps > 5:
             self._first_area = spot.area
-            return self._to("compress")
+            return self._enter_phase("compress")
         # Where it is not pressed later, the whole face is to touch: a tilted one is 4 mm off.
         return 6.0 * offset, 0.0 if self._press or self._steps > 24 else 0.15
 
     def _compress(self, image: NDArray[np.uint8], spots: list[Spot]) -> tuple[float, float]:
         """Press until next to nothing is dark where the spot was, and somewhat further."""
-        spot = self._same(spots)
+        spot = self._find_followed_spot(spots)
         self._last = spot or self._last
         assert self._last is not None
         (x, y), side = self._last.centre, math.sqrt(self._first_area)
         rows, columns = (slice(max(int(c - side), 0), int(c + side) + 1) for c in (y, x))
-        left = dark_pixels(image)[rows, columns].sum()
+        left = find_dark_pixels(image)[rows, columns].sum()
         self._gone = self._gone + 1 if left < 0.15 * self._first_area else 0
         if self._gone > 15 or self._steps > 90:
-            return self._to("hold")
+            return self._enter_phase("hold")
         aside = 0.0 if spot is None else 3.0 * (x / (image.shape[1] - 1) - 0.5)
         return aside, 0.25
 
     def _hold(self, *_: Any) -> tuple[float, float]:
-        return self._to("release") if self._steps >= 10 else (0.0, 0.0)
+        return self._enter_phase("release") if self._steps >= 10 else (0.0, 0.0)
 
     def _release(self, *_: Any) -> tuple[float, float]:
         """Go up, to where the probe came from."""
         return 0.0, -0.4
 
-    def _same(self, spots: list[Spot]) -> Spot | None:
+    def _find_followed_spot(self, spots: list[Spot]) -> Spot | None:
         """The spot that was followed so far: the nearest, where one is near."""
         if self._last is None or not spots:
             return None
@@ -141,7 +141,7 @@ class VisualServo:
         return near if apart < 1.2 * math.sqrt(self._last.area) else None
 
 
-class Wander:
+class WanderingAgent:
     """Smooth random motion over the skin, pressed and let go about every three seconds.
 
     Args:

@@ -32,17 +32,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim import __version__
-from us_sim.environment.agents import VisualServo, Wander
-from us_sim.environment.environment import ScanEnvironment, scene_of
+from us_sim.environment.agents import VisualServo, WanderingAgent
+from us_sim.environment.environment import ScanEnvironment, resolve_scene
 from us_sim.environment.tasks import TASKS
 from us_sim.errors import EpisodeError, UsSimError
 from us_sim.progress import Progress
-from us_sim.recording.attached_files import versions
+from us_sim.recording.attached_files import list_versions
 from us_sim.scene.scene import Scene
 from us_sim.settings.quantity import Quantity
-from us_sim.settings.reading import document_of
+from us_sim.settings.reading import dump_settings
 from us_sim.settings.setting import Settings, setting
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import format_count
 from us_sim.volume.partial_file import partial_file
 
 _COMPUTING = ("python", "us_sim_code", "numpy", "scipy", "numba", "opencv-python-headless")
@@ -81,7 +81,7 @@ class DatasetSettings(Settings):
 
 
 @dataclass(frozen=True)
-class _Order:
+class _EpisodeOrder:
     """An episode to be made."""
 
     scene: Scene
@@ -92,18 +92,18 @@ class _Order:
     out: Path  # or what stands for one where files are not on this machine
 
     @property
-    def shard(self) -> Path:
+    def shard_path(self) -> Path:
         return self.out / f"{self.name}.tar"
 
     @property
-    def facts(self) -> Path:
+    def facts_path(self) -> Path:
         return self.out / f"{self.name}.json"
 
-    def done(self) -> dict[str, Any] | None:
+    def read_facts(self) -> dict[str, Any] | None:
         """The facts of an episode that is there whole."""
         with contextlib.suppress(OSError, ValueError):
-            facts: dict[str, Any] = json.loads(self.facts.read_text(encoding="utf-8"))
-            if self.shard.is_file():
+            facts: dict[str, Any] = json.loads(self.facts_path.read_text(encoding="utf-8"))
+            if self.shard_path.is_file():
                 return facts
         return None
 
@@ -122,21 +122,21 @@ def make_dataset(
         UsSimError: a scene cannot be used, the folder holds another data set, a file cannot be
             written, or a process was ended.
     """
-    out = _folder(settings)
-    loaded = [scene_of(scene, settings=changes) for scene in scenes]
+    out = _open_folder(settings)
+    loaded = [resolve_scene(scene, settings=changes) for scene in scenes]
     _require_format(loaded, out, settings)
-    head = _head(scenes, loaded, settings)
+    head = _describe_dataset(scenes, loaded, settings)
     _require_same(out, head)
-    orders = list(_orders(scenes, loaded, settings, out))
-    found = {order.name: order.done() for order in orders}
+    orders = list(_plan_episodes(scenes, loaded, settings, out))
+    found = {order.name: order.read_facts() for order in orders}
     left = [order for order in orders if found[order.name] is None]
     # In this process first, where kernels are compiled and a volume is made with progress.
     for order in {order.scene_name: order for order in left}.values():
-        _environment(order)
+        _load_environment(order)
     try:
         with Progress("making", len(orders), "episodes") as bar:
             bar.update(len(orders) - len(left))
-            for order, facts in _made(left, settings):
+            for order, facts in _make_episodes(left, settings):
                 found[order.name] = facts
                 bar.update(sum(each is not None for each in found.values()))
     finally:
@@ -144,12 +144,12 @@ def make_dataset(
             shutil.rmtree(begun, ignore_errors=True)  # by processes that were killed
     made = {name: facts for name, facts in found.items() if facts is not None}
     failed = {name: facts["error"] for name, facts in made.items() if "error" in facts}
-    images = counted(sum(int(facts.get("images", 0)) for facts in made.values()), "image")
-    amount, successes = f"{images} in {counted(len(made) - len(failed), 'episode')}", {}
+    images = format_count(sum(int(facts.get("images", 0)) for facts in made.values()), "image")
+    amount, successes = f"{images} in {format_count(len(made) - len(failed), 'episode')}", {}
     if settings.task:
         successes["successes"] = sum(facts.get("is_success", False) for facts in made.values())
         amount += f", {successes['successes']} of them with the task done"
-    _write(out / "manifest.json", _json({**head, **successes, "episodes": made}))
+    _write(out / "manifest.json", _encode_json({**head, **successes, "episodes": made}))
     card = _CARD.read_text(encoding="utf-8").format(
         amount=amount,
         scenes=", ".join(scenes),
@@ -180,13 +180,13 @@ def _require_format(scenes: Sequence[Scene], out: Path, settings: DatasetSetting
     """
     if _FORMATS[settings.format] is None:
         return
-    from us_sim.environment.lerobot_episodes import frames_a_second
+    from us_sim.environment.lerobot_episodes import compute_frame_rate
     from us_sim.recording.lerobot_writer import require_lerobot
 
     require_lerobot()
     if not isinstance(out, Path):
         raise EpisodeError(f"--out {settings.out}: {settings.format} needs a folder, no address")
-    rates = {frames_a_second(scene.episode.period) for scene in scenes}
+    rates = {compute_frame_rate(scene.episode.period) for scene in scenes}
     if len(rates) > 1:
         raise EpisodeError(
             f"scenes have {sorted(rates)} steps a second, and a LeRobot data set one rate: make a "
@@ -194,39 +194,39 @@ def _require_format(scenes: Sequence[Scene], out: Path, settings: DatasetSetting
         )
 
 
-def _orders(
+def _plan_episodes(
     names: Sequence[str], scenes: Sequence[Scene], settings: DatasetSettings, out: Path
-) -> Iterator[_Order]:
+) -> Iterator[_EpisodeOrder]:
     for k, (name, scene) in enumerate(zip(names, scenes, strict=True)):
         for n in range(settings.episodes):
             words = np.random.SeedSequence([settings.seed, k, n]).generate_state(1)
             shard = f"{k:02d}-{scene.name.replace('/', '_')}-{n:06d}"
-            yield _Order(scene, name, settings.task, int(words[0]), shard, out)
+            yield _EpisodeOrder(scene, name, settings.task, int(words[0]), shard, out)
 
 
-_Submit = Callable[[_Order], "Future[dict[str, Any]]"]
+_Submit = Callable[[_EpisodeOrder], "Future[dict[str, Any]]"]
 
 
-def _made(
-    orders: Sequence[_Order], settings: DatasetSettings
-) -> Iterator[tuple[_Order, dict[str, Any]]]:
+def _make_episodes(
+    orders: Sequence[_EpisodeOrder], settings: DatasetSettings
+) -> Iterator[tuple[_EpisodeOrder, dict[str, Any]]]:
     """Each episode with its facts, as they are finished."""
     workers = min(settings.workers, len(orders))
     if len(orders) <= 1 or (workers == 1 and settings.ray is None):
-        yield from ((order, _episode(order)) for order in orders)
+        yield from ((order, _make_episode(order)) for order in orders)
         return
-    with _ray(settings.ray) if settings.ray else _processes(workers) as submit:
+    with _start_ray(settings.ray) if settings.ray else _start_processes(workers) as submit:
         waiting = {submit(order): order for order in orders}
         for future in as_completed(waiting):
             yield waiting[future], future.result()
 
 
 @contextlib.contextmanager
-def _processes(workers: int) -> Iterator[_Submit]:
+def _start_processes(workers: int) -> Iterator[_Submit]:
     context = multiprocessing.get_context("spawn")  # numba and threads are here already
     with ProcessPoolExecutor(workers, context, _begin_worker) as pool:
         try:
-            yield lambda order: pool.submit(_episode, order)
+            yield lambda order: pool.submit(_make_episode, order)
         except BrokenProcessPool as error:
             raise EpisodeError(
                 "a process that makes episodes was ended, as for want of memory: give the same "
@@ -250,7 +250,7 @@ def _end_with_parent() -> None:
 
 
 @contextlib.contextmanager
-def _ray(address: str) -> Iterator[_Submit]:
+def _start_ray(address: str) -> Iterator[_Submit]:
     """A Ray cluster, which makes an episode anew where its worker or node is lost.
 
     Raises:
@@ -274,7 +274,7 @@ def _ray(address: str) -> Iterator[_Submit]:
             f"one, and --ray local one for this command alone"
         ) from error
     try:
-        make = ray.remote(_episode)
+        make = ray.remote(_make_episode)
         yield lambda order: make.remote(order).future()
     except ray.exceptions.RayTaskError as error:
         raise error.cause from error
@@ -290,7 +290,7 @@ def _ray(address: str) -> Iterator[_Submit]:
 _environments: dict[tuple[str, str | None], ScanEnvironment] = {}
 
 
-def _environment(order: _Order) -> ScanEnvironment:
+def _load_environment(order: _EpisodeOrder) -> ScanEnvironment:
     """The environment of this process for an order's scene and task."""
     key = order.scene_name, order.task
     if key not in _environments:
@@ -301,7 +301,7 @@ def _environment(order: _Order) -> ScanEnvironment:
     return _environments[key]
 
 
-def _episode(order: _Order) -> dict[str, Any]:
+def _make_episode(order: _EpisodeOrder) -> dict[str, Any]:
     """Make an episode and its files; where it fails, the facts say why, and there is no shard.
 
     Raises:
@@ -309,8 +309,8 @@ def _episode(order: _Order) -> dict[str, Any]:
     """
     facts: dict[str, Any] = {"seed": order.seed}
     try:
-        with _whole_file(order.shard, _FullError) as path:
-            facts |= _record(order, path)
+        with _open_whole_file(order.shard_path, _FullError) as path:
+            facts |= _record_shard(order, path)
     except _FullError as error:
         raise EpisodeError(
             f"{error}; make room and give the same command again, the episodes made so far are kept"
@@ -318,7 +318,7 @@ def _episode(order: _Order) -> dict[str, Any]:
     except Exception as error:  # a solver's own, say: the other episodes go on
         problem = str(error) if isinstance(error, UsSimError) else repr(error)
         facts["error"] = problem
-    _write(order.facts, _json(facts))
+    _write(order.facts_path, _encode_json(facts))
     return facts
 
 
@@ -326,27 +326,29 @@ class _FullError(UsSimError):
     """A shard cannot be written."""
 
 
-def _record(order: _Order, path: Path) -> dict[str, Any]:
-    environment = _environment(order)
+def _record_shard(order: _EpisodeOrder, path: Path) -> dict[str, Any]:
+    environment = _load_environment(order)
     observation, info = environment.reset(seed=order.seed)
     draw, images, is_success = info["draw"], 0, False
-    agent: Any = Wander(order.seed)
+    agent: Any = WanderingAgent(order.seed)
     if order.task in ("FindVein", "CompressVein"):
         agent = VisualServo(press=order.task == "CompressVein")
     labels = environment.simulation.volume.label_names
     with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as shard:
         while True:
             action = environment.translate_twist(agent.act(observation))
-            members = _members(environment, observation, labels)
+            members = _collect_members(environment, observation, labels)
             observation, reward, done, truncated, info = environment.step(action)
             step = members.pop("json") | {"action": action.tolist()}
             if order.task:
                 known = {
-                    name: fact for name, fact in environment.task.facts().items() if fact == fact
+                    name: fact
+                    for name, fact in environment.task.collect_facts().items()
+                    if fact == fact
                 }
                 step |= {"reward": reward, "is_success": done, **known}
                 is_success = is_success or done
-            members["json"] = _json(step)
+            members["json"] = _encode_json(step)
             for ending, content in members.items():
                 entry = tarfile.TarInfo(f"{order.name}_{images:05d}.{ending}")
                 entry.size = len(content)
@@ -358,12 +360,12 @@ def _record(order: _Order, path: Path) -> dict[str, Any]:
     return facts | ({"is_success": is_success} if order.task else {})
 
 
-def _members(
+def _collect_members(
     environment: ScanEnvironment, observation: Mapping[str, NDArray[Any]], labels: Mapping[int, str]
 ) -> dict[str, Any]:
     """The files of a step by their endings; ``json`` is still a mapping."""
     state, area = environment.truth, environment.simulation.pixel_area
-    members: dict[str, Any] = {"image.png": _png(state.image)}
+    members: dict[str, Any] = {"image.png": _encode_png(state.image)}
     step: dict[str, Any] = {
         "pose": [*state.pose.position.tolist(), *state.pose.orientation.tolist()],
         "wrench": state.wrench.tolist(),
@@ -374,43 +376,43 @@ def _members(
         },
     }
     if labels:
-        members["labels.png"] = _png(state.labels)
+        members["labels.png"] = _encode_png(state.labels)
         counts = np.bincount(state.labels.ravel(), minlength=256)
         step["areas"] = {name: float(area * counts[n]) for n, name in labels.items()}
     if environment.scene.tissue is not None:
-        members["displacement.npy"] = _npy(state.displacement, 1e-6)
+        members["displacement.npy"] = _encode_npy(state.displacement, 1e-6)
         if "strain" in environment.scene.episode.observe:
-            members["strain.npy"] = _npy(state.strain, 1e-4)
+            members["strain.npy"] = _encode_npy(state.strain, 1e-4)
     return members | {"json": step}
 
 
-def _png(image: NDArray[np.uint8]) -> bytes:
+def _encode_png(image: NDArray[np.uint8]) -> bytes:
     how = cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE
     _, content = cv2.imencode(".png", image, how)
     return content.tobytes()
 
 
-def _npy(array: NDArray[np.float32], unit: float) -> bytes:
+def _encode_npy(array: NDArray[np.float32], unit: float) -> bytes:
     """An int16 array in a unit, as a file; a quarter of the bytes of float64, and no subnormals."""
     stream = io.BytesIO()
     np.save(stream, np.rint(array / unit).clip(-32768, 32767).astype(np.int16))
     return stream.getvalue()
 
 
-def _head(
+def _describe_dataset(
     names: Sequence[str], scenes: Sequence[Scene], settings: DatasetSettings
 ) -> dict[str, Any]:
     """All that decides the bytes, as JSON gives it back."""
-    lines = (line.rpartition(" ") for line in versions().splitlines())
+    lines = (line.rpartition(" ") for line in list_versions().splitlines())
     found = {name: version for name, _, version in lines if name in _COMPUTING}
     head = {
         "seed": settings.seed,
         "task": settings.task,
         "episodes_of_each_scene": settings.episodes,
-        "scenes": {name: document_of(scene) for name, scene in zip(names, scenes, strict=True)},
+        "scenes": {name: dump_settings(scene) for name, scene in zip(names, scenes, strict=True)},
         "versions": {"us_sim": __version__, **found},
     }
-    same: dict[str, Any] = json.loads(_json(head))
+    same: dict[str, Any] = json.loads(_encode_json(head))
     return same
 
 
@@ -426,7 +428,7 @@ def _require_same(out: Path, head: Mapping[str, Any]) -> None:
         if not manifest.exists():
             if out.exists() and any(out.iterdir()):  # a store of objects has no empty folders
                 raise EpisodeError(f"--out {out}: is not empty; choose another folder")
-            _write(manifest, _json({**head, "episodes": {}}))
+            _write(manifest, _encode_json({**head, "episodes": {}}))
             return
         there = json.loads(manifest.read_text(encoding="utf-8"))
     except ValueError:
@@ -443,11 +445,11 @@ def _require_same(out: Path, head: Mapping[str, Any]) -> None:
         )
 
 
-def _json(content: Mapping[str, Any]) -> bytes:
+def _encode_json(content: Mapping[str, Any]) -> bytes:
     return (json.dumps(content, indent=1, sort_keys=True) + "\n").encode()
 
 
-def _folder(settings: DatasetSettings) -> Path:
+def _open_folder(settings: DatasetSettings) -> Path:
     """The folder of a data set, or what stands for it at an address.
 
     Raises:
@@ -473,7 +475,7 @@ def _folder(settings: DatasetSettings) -> Path:
 
 
 @contextlib.contextmanager
-def _whole_file(path: Any, error_type: type[UsSimError] = EpisodeError) -> Iterator[Path]:
+def _open_whole_file(path: Any, error_type: type[UsSimError] = EpisodeError) -> Iterator[Path]:
     """A file of this machine to write, which is at ``path`` at the end, whole or not at all."""
     is_here = isinstance(path, Path)
     with contextlib.ExitStack() as stack:
@@ -488,5 +490,5 @@ def _whole_file(path: Any, error_type: type[UsSimError] = EpisodeError) -> Itera
 
 
 def _write(path: Path, content: bytes) -> None:
-    with _whole_file(path) as partial:
+    with _open_whole_file(path) as partial:
         partial.write_bytes(content)

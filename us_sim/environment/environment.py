@@ -24,15 +24,15 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
-from us_sim.environment.simulation import Draw, Simulation, State
+from us_sim.environment.simulation import EpisodeDraw, ScanSimulation, ScanState
 from us_sim.environment.tasks import TASKS
 from us_sim.errors import EpisodeError, SceneError
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import exp
-from us_sim.scene.reading import merged, parse_scene, scene_document
+from us_sim.scene.reading import merge_documents, parse_scene, read_scene_document
 from us_sim.scene.scene import CASE_PREFIX, Scene
-from us_sim.settings.spelling import unknown
-from us_sim.tracking.robot import approach_speed, kept_within
+from us_sim.settings.spelling import describe_unknown
+from us_sim.tracking.robot import clip_to_reach, compute_approach_speed
 
 DEFAULT_SCENE = "upper_arm_learning"
 
@@ -46,7 +46,7 @@ _EPISODE = ("draw", "task", "_step", "_done", "_late")
 Observation = dict[str, NDArray[Any]]
 
 
-def scene_of(
+def resolve_scene(
     scene: str | Scene | None = None,
     case: str | None = None,
     settings: Mapping[str, Any] | None = None,
@@ -68,9 +68,9 @@ def scene_of(
     if isinstance(scene, Scene):
         return scene
     name = f"{CASE_PREFIX}{case}" if case is not None else scene or DEFAULT_SCENE
-    document, folders, origin = scene_document(name)
+    document, folders, origin = read_scene_document(name)
     if settings:
-        document = merged(document, _plain(settings))
+        document = merge_documents(document, _convert_numpy(settings))
     return parse_scene(document, origin=origin, folders=folders)
 
 
@@ -79,7 +79,7 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     Args:
         task: a name in `TASKS`.
-        scene, case, settings: as `scene_of`.
+        scene, case, settings: as `resolve_scene`.
         render_mode: ``rgb_array``, the image; or None.
 
     Raises:
@@ -104,19 +104,19 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         render_mode: str | None = None,
     ) -> None:
         if task not in TASKS:
-            raise EpisodeError(f"task {unknown(task, TASKS)}")
+            raise EpisodeError(f"task {describe_unknown(task, TASKS)}")
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise EpisodeError(f"render_mode {unknown(str(render_mode), ['rgb_array'])}")
+            raise EpisodeError(f"render_mode {describe_unknown(str(render_mode), ['rgb_array'])}")
         self.render_mode = render_mode
-        self.scene = scene_of(scene, case, settings)
+        self.scene = resolve_scene(scene, case, settings)
         self._task_class = TASKS[task]
         self._settings = episode = self.scene.episode
         _require_observable(self.scene)
         self.metadata = {**self.metadata, "render_fps": round(1 / episode.period)}
-        self.simulation = Simulation(self.scene)
+        self.simulation = ScanSimulation(self.scene)
         self.task = self._task_class(self.simulation)  # refused now rather than at a reset
-        self.draw = Draw()
-        self._truth: State | None = None
+        self.draw = EpisodeDraw()
+        self._truth: ScanState | None = None
         self._step = 0
         self._done = 0.0  # part of the task
         self.action_space = spaces.Box(-1.0, 1.0, (6,), np.float32)
@@ -165,19 +165,21 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         super().reset(seed=seed)
         draws = self._settings.draws
         given: dict[str, Any] = {}
-        for name, value in _plain(options or {}).items():
+        for name, value in _convert_numpy(options or {}).items():
             if name not in vars(draws):
-                raise SceneError(f"options: {unknown(name, vars(draws))}")
+                raise SceneError(f"options: {describe_unknown(name, vars(draws))}")
             given[name] = value if isinstance(value, list) else (value, value)
-        self.draw = Draw.of(dataclasses.replace(draws, **given), self.scene, self.np_random)
+        self.draw = EpisodeDraw.sample_values(
+            dataclasses.replace(draws, **given), self.scene, self.np_random
+        )
         self.simulation.reset(self.draw)
         self.task = self._task_class(self.simulation)
         self._step, self._done = 0, 0.0
         self._late: deque[Observation] = deque(maxlen=self.draw.delay + 1)
-        start = kept_within(self.draw.start, Pose(), self._settings)
+        start = clip_to_reach(self.draw.start, Pose(), self._settings)
         self._truth = self.simulation.step(start)
-        self.task.begin(self._truth)
-        return self._observe(), self._info()
+        self.task.begin_episode(self._truth)
+        return self._observe(), self._make_info()
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Move the probe for one period.
@@ -191,16 +193,16 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
             EpisodeError: the action is no six numbers from -1 to 1, or no episode has begun.
         """
         before = self.truth
-        velocity = self._velocity(_checked(action))
+        velocity = self._compute_velocity(_check_action(action))
         moved = before.pose @ exp(velocity * self._settings.period)
-        self._truth = self.simulation.step(kept_within(moved, before.pose, self._settings))
+        self._truth = self.simulation.step(clip_to_reach(moved, before.pose, self._settings))
         self._step += 1
-        reward, done = self.task.judge(self._truth)
+        reward, done = self.task.judge_step(self._truth)
         reward = reward / self._settings.steps + done - self._done
         self._done = done
         is_done = done == 1.0
         truncated = not is_done and self._step >= self._settings.steps
-        return self._observe(), reward, is_done, truncated, self._info()
+        return self._observe(), reward, is_done, truncated, self._make_info()
 
     def render(self) -> Any:
         """(rows, columns, 3) the image as red, green and blue; None without a render mode.
@@ -213,7 +215,7 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         return np.repeat(self.truth.image[..., None], 3, axis=2)
 
     @property
-    def truth(self) -> State:
+    def truth(self) -> ScanState:
         """Truth of the last step.
 
         Raises:
@@ -253,25 +255,25 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
             translated[2] = np.clip(2 * wanted / given.force - 1, -1, 1)
         return translated
 
-    def _info(self) -> dict[str, Any]:
+    def _make_info(self) -> dict[str, Any]:
         force = self.truth.force
         return {
             "is_success": self._done == 1.0,
             "force": force,
             "cost": max(force - self._settings.force, 0.0),
             "is_balanced": self.truth.is_balanced,
-            "draw": self.draw.document(),
-            **self.task.facts(),
+            "draw": self.draw.to_document(),
+            **self.task.collect_facts(),
         }
 
-    def _velocity(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _compute_velocity(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return (6,) m/s, rad/s in the probe's frame."""
         given = self._settings
         velocity = action * np.repeat([given.speed, given.angular_speed], 3)
         if given.control == "force":
             wanted = 0.5 * (action[2] + 1.0) * given.force
             damping = given.force_error / given.speed
-            velocity[2] = approach_speed(wanted, self.truth.force, damping, given.speed)
+            velocity[2] = compute_approach_speed(wanted, self.truth.force, damping, given.speed)
         return velocity
 
     def _observe(self) -> Observation:
@@ -281,9 +283,9 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         noise *= np.repeat([draw.position_noise, draw.orientation_noise], 3)
         for name, space in self._spaces.items():
             if name == "pose":
-                value: Any = _seven(state.pose @ exp(noise))
+                value: Any = _pack_pose(state.pose @ exp(noise))
             elif name == "goal":
-                value = _seven(self.task.goal(self._step))
+                value = _pack_pose(self.task.compute_goal(self._step))
             else:
                 value = getattr(state, name)
             limited = np.asarray(value, space.dtype).reshape(space.shape)
@@ -306,7 +308,7 @@ def _require_observable(scene: Scene) -> None:
             )
 
 
-def _checked(action: ArrayLike) -> NDArray[np.float64]:
+def _check_action(action: ArrayLike) -> NDArray[np.float64]:
     try:
         numbers = np.asarray(action, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -316,15 +318,15 @@ def _checked(action: ArrayLike) -> NDArray[np.float64]:
     return np.clip(numbers, -1.0, 1.0)
 
 
-def _seven(pose: Pose) -> NDArray[np.float64]:
+def _pack_pose(pose: Pose) -> NDArray[np.float64]:
     """Return position (m) and quaternion x, y, z, w."""
     return np.concatenate([pose.position, pose.orientation])
 
 
-def _plain(value: Any) -> Any:
+def _convert_numpy(value: Any) -> Any:
     """Return mappings, lists and numbers with NumPy's as Python's."""
     if isinstance(value, Mapping):
-        return {key: _plain(each) for key, each in value.items()}
+        return {key: _convert_numpy(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
+        return [_convert_numpy(each) for each in value]
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value

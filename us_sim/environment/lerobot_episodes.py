@@ -66,16 +66,16 @@ def write_lerobot(
     about = inspect.getdoc(TASKS[task]) if task else "Scan the skin."
     with Progress("writing for LeRobot", len(episodes), "episodes") as bar:
 
-        def each() -> Iterator[LeRobotEpisode]:
+        def read_episodes() -> Iterator[LeRobotEpisode]:
             for done, (name, facts) in enumerate(sorted(episodes.items()), 1):
                 frames, names = read_episode(shards / f"{name}.tar", facts)
                 yield LeRobotEpisode(frames, names, str(about), f"{name} of {facts['scene']}")
                 bar.update(done)
 
-        write_episodes(folder, frames_a_second(period), each(), is_video=is_video)
+        write_episodes(folder, compute_frame_rate(period), read_episodes(), is_video=is_video)
 
 
-def frames_a_second(period: float) -> int:
+def compute_frame_rate(period: float) -> int:
     """The frames a second of steps of a period (s).
 
     Raises:
@@ -99,11 +99,11 @@ def read_episode(
         shard: the episode's tar file.
         facts: of the episode.
     """
-    steps = list(_steps(shard))
-    return _frames(steps, facts), _names(steps[0], facts)
+    steps = list(_read_steps(shard))
+    return _make_frames(steps, facts), _name_numbers(steps[0], facts)
 
 
-def _steps(shard: Path) -> Iterator[_Step]:
+def _read_steps(shard: Path) -> Iterator[_Step]:
     """The members of each step that are used."""
     members: dict[str, dict[str, Any]] = {}
     with shard.open("rb") as stream, tarfile.open(fileobj=stream, mode="r|") as tar:
@@ -117,7 +117,7 @@ def _steps(shard: Path) -> Iterator[_Step]:
         yield step
 
 
-def _names(step: _Step, facts: Mapping[str, Any]) -> dict[str, Sequence[str]]:
+def _name_numbers(step: _Step, facts: Mapping[str, Any]) -> dict[str, Sequence[str]]:
     """Of the numbers of each feature, and of the labels."""
     told = step["json"]
     state = [f"{name}.{part}" for name in sorted(told["observed"]) for part in _PARTS[name]]
@@ -131,11 +131,11 @@ def _names(step: _Step, facts: Mapping[str, Any]) -> dict[str, Sequence[str]]:
     }
 
 
-def _frames(steps: Sequence[_Step], facts: Mapping[str, Any]) -> Iterator[Frame]:
+def _make_frames(steps: Sequence[_Step], facts: Mapping[str, Any]) -> Iterator[Frame]:
     late: deque[NDArray[np.uint8]] = deque(maxlen=facts["draw"]["delay"] + 1)
     for step in steps:
         told = step["json"]
-        late.append(_pixels(step["image.png"]))
+        late.append(_decode_png(step["image.png"]))
         frame: dict[str, NDArray[Any]] = {f"{IMAGES}ultrasound": late[0]}
         if observed := told["observed"]:
             frame[STATE] = _float32(np.concatenate([observed[name] for name in sorted(observed)]))
@@ -150,7 +150,7 @@ def _frames(steps: Sequence[_Step], facts: Mapping[str, Any]) -> Iterator[Frame]
         frame["truth.contact"] = _float32([told["contact"]])
         if "areas" in told:
             frame["truth.areas"] = _float32([area for _, area in sorted(told["areas"].items())])
-            frame["truth.labels"] = _pixels(step["labels.png"])
+            frame["truth.labels"] = _decode_png(step["labels.png"])
         yield frame
 
 
@@ -158,7 +158,7 @@ def _float32(numbers: Any) -> NDArray[np.float32]:
     return np.array(numbers, np.float32)
 
 
-def _pixels(png: bytes) -> NDArray[np.uint8]:
+def _decode_png(png: bytes) -> NDArray[np.uint8]:
     found = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
     return np.asarray(found, np.uint8)
 

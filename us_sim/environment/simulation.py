@@ -3,10 +3,10 @@
 It makes the same objects as the nodes do in lockstep, and calls them in the same order. Frames are
 counted in iterations and on one thread, so that the same poses give the same bytes.
 
->>> from us_sim.environment.simulation import Simulation
+>>> from us_sim.environment.simulation import ScanSimulation
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.scene.reading import load_scene
->>> simulation = Simulation(load_scene("tests/small_scene.yaml"))
+>>> simulation = ScanSimulation(load_scene("tests/small_scene.yaml"))
 >>> state = simulation.step(Pose([0.0, 0.0, 0.006]))
 >>> state.image.shape, bool(state.force > 1.0)  # N
 ((80, 96), True)
@@ -30,25 +30,25 @@ from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import rotation_exp
 from us_sim.progress import late_progress
 from us_sim.scene.building import (
-    label_fractions_of,
-    materials_of,
-    membrane_of,
-    scanner_of,
-    tissue_model_of,
-    volume_of,
+    build_materials,
+    build_membrane,
+    build_scanner,
+    build_tissue_model,
+    compute_label_fractions,
+    load_volume,
 )
-from us_sim.scene.episode import Draws
+from us_sim.scene.episode import DrawRanges
 from us_sim.scene.scene import Scene
-from us_sim.scoring.lumen import lifted
+from us_sim.scoring.lumen import lift_probe
 from us_sim.settings.registry import SOLVERS
 from us_sim.skin.membrane import SkinMembrane
-from us_sim.slicing.acoustics.surface_echo import surface_normals_of
+from us_sim.slicing.acoustics.surface_echo import find_surface_normals
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.frame import Frame
-from us_sim.slicing.strain import AxialStrain, displacement
-from us_sim.tissue.elasticity.material import kind_of
+from us_sim.slicing.strain import AxialStrain, compute_displacement
+from us_sim.tissue.elasticity.material import guess_tissue_kind
 from us_sim.tissue.elasticity.materials import LabelFractions
-from us_sim.tissue.live_tissue import compiled_solver
+from us_sim.tissue.live_tissue import compile_solver
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.solver import TissueSolver
@@ -59,8 +59,8 @@ _VOLUMES = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Draw:
-    """An episode's values, drawn from `Draws`; as they are here, the scene is as it says."""
+class EpisodeDraw:
+    """An episode's values, drawn from `DrawRanges`; as they are here, the scene is as it says."""
 
     stiffness: Mapping[str, float] = field(default_factory=dict)  # factor by label; else 1
     lumen_pressure: float = 1.0  # factor
@@ -73,39 +73,44 @@ class Draw:
     delay: int = 0  # steps
 
     @classmethod
-    def of(cls, draws: Draws, scene: Scene, random: np.random.Generator) -> Draw:
+    def sample_values(
+        cls, draws: DrawRanges, scene: Scene, random: np.random.Generator
+    ) -> EpisodeDraw:
         """The next values; a fixed number of them is taken, whatever the ranges are."""
 
-        def linear(name: str, count: int | None = None) -> Any:
+        def sample_linear(name: str, count: int | None = None) -> Any:
             low, high = getattr(draws, name)
             return random.uniform(low, high, count)
 
-        def factor(name: str, count: int | None = None) -> Any:
+        def sample_factor(name: str, count: int | None = None) -> Any:
             low, high = np.log(getattr(draws, name))
             return np.exp(random.uniform(low, high, count))
 
         labels = sorted(scene.tissue.materials) if scene.tissue else []
-        stiffness = dict(zip(labels, factor("stiffness", len(labels)).tolist(), strict=True))
-        lumen_pressure, thickness = float(factor("lumen_pressure")), float(linear("thickness"))
-        place = [linear("lateral"), linear("elevational"), -linear("height")]
-        turn = np.array([*linear("tilt", 2), linear("rotation")])
-        gain = float(linear("gain"))
+        stiffness = dict(zip(labels, sample_factor("stiffness", len(labels)).tolist(), strict=True))
+        lumen_pressure, thickness = (
+            float(sample_factor("lumen_pressure")),
+            float(sample_linear("thickness")),
+        )
+        place = [sample_linear("lateral"), sample_linear("elevational"), -sample_linear("height")]
+        turn = np.array([*sample_linear("tilt", 2), sample_linear("rotation")])
+        gain = float(sample_linear("gain"))
         speckle = int(random.integers(*draws.speckle, endpoint=True))
-        noise = float(linear("position_noise")), float(linear("orientation_noise"))
+        noise = float(sample_linear("position_noise")), float(sample_linear("orientation_noise"))
         delay = int(random.integers(*draws.delay, endpoint=True))
         start = Pose(np.array(place), rotation_exp(turn))
         is_phantom = scene.volume.phantom is not None
         seed = speckle if is_phantom else None
         return cls(stiffness, lumen_pressure, thickness, start, gain, seed, *noise, delay)
 
-    def document(self) -> dict[str, Any]:
+    def to_document(self) -> dict[str, Any]:
         """The values as JSON, in SI units."""
         start = [*self.start.position.tolist(), *self.start.orientation.tolist()]
         return {**vars(self), "stiffness": dict(self.stiffness), "start": start}
 
 
 @dataclass(eq=False)
-class State:
+class ScanState:
     """A pose of the probe, and what follows from it; images are made when they are asked for."""
 
     pose: Pose  # of the probe, true
@@ -138,27 +143,27 @@ class State:
     @cached_property
     def displacement(self) -> NDArray[np.float32]:
         """(rows, columns, 2) m, lateral and axial way from rest; 0 where no tissue is."""
-        return np.nan_to_num(displacement(self.frame))
+        return np.nan_to_num(compute_displacement(self.frame))
 
     @cached_property
     def strain(self) -> NDArray[np.float32]:
         """(rows, columns) axial strain against rest; 0 where no tissue is."""
         assert self.strains is not None
-        return np.nan_to_num(self.strains.image(self.frame))
+        return np.nan_to_num(self.strains.compute_strain(self.frame))
 
 
 @dataclass(frozen=True, eq=False)
-class SimulationState:
+class SimulationSnapshot:
     """All that decides what a simulation gives for a pose."""
 
-    draw: Draw
+    draw: EpisodeDraw
     solver: TissueSolver | None
     membrane: SkinMembrane | None
     wrench: NDArray[np.float64]
     number: int  # of poses so far
 
 
-class Simulation:
+class ScanSimulation:
     """The tissue, the skin and the scanner of a scene, as a draw changes them.
 
     Raises:
@@ -173,7 +178,7 @@ class Simulation:
         self._shape: tuple[Any, ...] | None = None
         self._materials: tuple[Any, ...] | None = None
         self._solver: TissueSolver | None = None
-        self._membrane = membrane_of(scene) if scene.skin and scene.imaging.contact else None
+        self._membrane = build_membrane(scene) if scene.skin and scene.imaging.contact else None
         self._strains: AxialStrain | None = None
         self._mesh: TetrahedralMesh
         self.scanner: BMode
@@ -185,7 +190,7 @@ class Simulation:
         """m² of a pixel."""
         return float(np.prod(self.scanner.probe.pixel_spacing))
 
-    def label(self, name: str | None) -> int:
+    def find_label(self, name: str | None) -> int:
         """The number of the label of that name; of the first vein where it is None.
 
         Raises:
@@ -193,7 +198,7 @@ class Simulation:
         """
         names = self.volume.label_names if self.volume.labels is not None else {}
         for number, each in names.items():
-            if each == name or (name is None and kind_of(each) == "vein"):
+            if each == name or (name is None and guess_tissue_kind(each) == "vein"):
                 return number
         what = f"label `{name}`" if name else "vein"
         has = ", ".join(names.values()) or "no labels"
@@ -202,13 +207,13 @@ class Simulation:
             f"another scene or label"
         )
 
-    def reset(self, draw: Draw | None = None) -> None:
+    def reset(self, draw: EpisodeDraw | None = None) -> None:
         """Bring the tissue to rest with no probe near, and make what a draw changes.
 
         Raises:
             UsSimError: something cannot be made.
         """
-        self._draw = draw = draw or Draw()
+        self._draw = draw = draw or EpisodeDraw()
         with self._blas.limit(limits=1, user_api="blas"):
             shape = draw.speckle, draw.thickness
             materials = *shape, draw.lumen_pressure, dict(draw.stiffness)
@@ -225,13 +230,13 @@ class Simulation:
             self._membrane.reset()
         imaging = self.scene.imaging
         gain = imaging.gain + draw.gain
-        self.scanner.use(
+        self.scanner.apply_settings(
             self.scanner.probe, dataclasses.replace(imaging, gain=gain), imaging.acoustics
         )
         self._number = 0
         self._wrench = np.zeros(6)
 
-    def step(self, pose: Pose) -> State:
+    def step(self, pose: Pose) -> ScanState:
         """Move the probe to a pose in frame ``patient``, and let tissue and skin follow.
 
         Raises:
@@ -246,43 +251,43 @@ class Simulation:
             skin = self._membrane.deform(pose).vertices if self._membrane is not None else None
         nodes = deformation.nodes if deformation is not None else None
         time = self._number * self.scene.episode.period
-        frame = self.scanner.frame(pose, nodes, skin=skin, number=self._number, time=time)
+        frame = self.scanner.make_frame(pose, nodes, skin=skin, number=self._number, time=time)
         self._number += 1
         is_balanced = deformation is None or deformation.is_balanced
-        return State(pose, frame, self._wrench, is_balanced, self._strains)
+        return ScanState(pose, frame, self._wrench, is_balanced, self._strains)
 
-    def state(self) -> SimulationState:
+    def state(self) -> SimulationSnapshot:
         """Copy where tissue and skin are, so that `restore` can go on from here."""
-        moving = _copied(self._solver), _copied(self._membrane)
-        return SimulationState(self._draw, *moving, self._wrench, self._number)
+        moving = _copy_moving(self._solver), _copy_moving(self._membrane)
+        return SimulationSnapshot(self._draw, *moving, self._wrench, self._number)
 
-    def restore(self, state: SimulationState) -> None:
+    def restore(self, state: SimulationSnapshot) -> None:
         """Go on from a state of this simulation, as often as is wanted."""
         if state.draw is not self._draw:
             self.reset(state.draw)
-        self._solver, self._membrane = _copied(state.solver), _copied(state.membrane)
+        self._solver, self._membrane = _copy_moving(state.solver), _copy_moving(state.membrane)
         self._wrench, self._number = state.wrench, state.number
 
-    def labels_at_rest(self, pose: Pose) -> NDArray[np.uint8]:
+    def compute_labels_at_rest(self, pose: Pose) -> NDArray[np.uint8]:
         """(rows, columns) labels in the plane of a pose if the probe did not press."""
         nodes = self._solver.model.mesh.nodes if self._solver is not None else None
-        return self.scanner.labels(lifted(pose), nodes)
+        return self.scanner.render_labels(lift_probe(pose), nodes)
 
-    def _make_scanner(self, draw: Draw) -> None:
-        base, model, _ = self._drawn_from(draw.speckle)
+    def _make_scanner(self, draw: EpisodeDraw) -> None:
+        base, model, _ = self._load_drawn(draw.speckle)
         deeper = np.diag([1.0, 1.0, draw.thickness, 1.0])
         self.volume = dataclasses.replace(base, index_to_patient=deeper @ base.index_to_patient)
-        self.scanner = scanner_of(self.scene, self.volume)
+        self.scanner = build_scanner(self.scene, self.volume)
         if self._membrane is not None:
             surface = self._membrane.surface
-            self.scanner.touch(surface.vertices, surface.triangles)
+            self.scanner.attach_skin(surface.vertices, surface.triangles)
         if model is not None:
-            self._mesh = mesh = _deeper(model.mesh, draw.thickness)
-            self.scanner.carry(mesh.nodes, mesh.tetrahedra)
+            self._mesh = mesh = _scale_depths(model.mesh, draw.thickness)
+            self.scanner.attach_mesh(mesh.nodes, mesh.tetrahedra)
             self._strains = AxialStrain(mesh.nodes, mesh.tetrahedra)
 
-    def _make_tissue(self, draw: Draw) -> None:
-        scene, (_, model, fractions) = self.scene, self._drawn_from(draw.speckle)
+    def _make_tissue(self, draw: EpisodeDraw) -> None:
+        scene, (_, model, fractions) = self.scene, self._load_drawn(draw.speckle)
         if model is None or scene.tissue is None:
             return
         materials = {
@@ -293,17 +298,17 @@ class Simulation:
             )
             for name, given in scene.tissue.materials.items()
         }
-        constants = materials_of(scene, materials, self._mesh, self.volume, fractions)
+        constants = build_materials(scene, materials, self._mesh, self.volume, fractions)
         model = dataclasses.replace(model, mesh=self._mesh, materials=constants)
         method = SOLVERS.load(scene.tissue.solver)
         settings = scene.solver_settings(scene.tissue.solver) or method.Settings()
         if self._solver is None:
             show = late_progress("preparing the tissue")
-            self._solver = compiled_solver(method, model, settings, show)
+            self._solver = compile_solver(method, model, settings, show)
         else:
             self._solver = method(model, settings)
 
-    def _drawn_from(
+    def _load_drawn(
         self, speckle: int | None
     ) -> tuple[Volume, TissueModel | None, LabelFractions | None]:
         """The scene's volume, its tissue, and the labels in that; they are kept for some seeds."""
@@ -311,11 +316,11 @@ class Simulation:
             given, scene = self.scene.volume, self.scene
             if speckle is not None:
                 scene = dataclasses.replace(scene, volume=dataclasses.replace(given, seed=speckle))
-            volume = volume_of(scene, late_progress("making the volume"))
-            model = tissue_model_of(scene, volume) if scene.tissue else None
-            fractions = label_fractions_of(model.mesh, volume) if model else None
+            volume = load_volume(scene, late_progress("making the volume"))
+            model = build_tissue_model(scene, volume) if scene.tissue else None
+            fractions = compute_label_fractions(model.mesh, volume) if model else None
             is_live = scene.imaging.acoustics.is_live and volume.labels is not None
-            self._normals[speckle] = surface_normals_of(volume) if is_live else None
+            self._normals[speckle] = find_surface_normals(volume) if is_live else None
             while len(self._volumes) >= _VOLUMES:
                 oldest = next(iter(self._volumes))
                 del self._volumes[oldest], self._normals[oldest]
@@ -326,7 +331,7 @@ class Simulation:
 T = TypeVar("T")
 
 
-def _copied(moving: T) -> T:
+def _copy_moving(moving: T) -> T:
     """Copy what moves, but not the frozen dataclasses in it, such as the model."""
     constants = [
         value
@@ -336,7 +341,7 @@ def _copied(moving: T) -> T:
     return copy.deepcopy(moving, {id(constant): constant for constant in constants})
 
 
-def _deeper(mesh: TetrahedralMesh, factor: float) -> TetrahedralMesh:
+def _scale_depths(mesh: TetrahedralMesh, factor: float) -> TetrahedralMesh:
     """The mesh with all depths multiplied."""
     if mesh.planes is not None:
         x, y, z = mesh.planes

@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.environment.simulation import Simulation, State
+from us_sim.environment.simulation import ScanSimulation, ScanState
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import rotation_exp
 from us_sim.slicing.settings import WALLS_TOUCH
@@ -25,56 +25,56 @@ _TOUCHING = 0.9
 """Part of the face that touches."""
 
 
-class Task(ABC):
+class EpisodeTask(ABC):
     """A task of one episode."""
 
     in_short: ClassVar[str]
     """The task, for a person."""
     has_goal: ClassVar[bool] = False
-    """Whether observations have an entry `goal`, a pose."""
+    """Whether observations have an entry `compute_goal`, a pose."""
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, simulation: ScanSimulation) -> None:
         self._simulation = simulation
         self._held = 0  # steps in a row
 
-    def begin(self, state: State) -> None:  # noqa: B027 - most tasks begin alike
+    def begin_episode(self, state: ScanState) -> None:  # noqa: B027 - most tasks begin alike
         """Begin with the probe where an episode starts."""
 
     @abstractmethod
-    def judge(self, state: State) -> tuple[float, float]:
+    def judge_step(self, state: ScanState) -> tuple[float, float]:
         """Return a step's reward, -1 to 0, and the part of the task that is done, 0 to 1."""
 
-    def goal(self, step: int) -> Pose:  # noqa: ARG002
+    def compute_goal(self, step: int) -> Pose:  # noqa: ARG002
         """Return the pose to be at, where the task has one."""
         return Pose()
 
-    def facts(self) -> dict[str, float]:
+    def collect_facts(self) -> dict[str, float]:
         """Return truths of the last step, for a person or a data set."""
         return {}
 
-    def _hold(self, is_right: bool, steps: int) -> bool:
+    def _has_held(self, is_right: bool, steps: int) -> bool:
         """Return whether this and the last steps were right."""
         self._held = self._held + 1 if is_right else 0
         return self._held >= steps
 
 
-class _VesselTask(Task):
+class _VesselTask(EpisodeTask):
     """A task about the target vessel, whose cross-section is compared with the plane's at rest."""
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, simulation: ScanSimulation) -> None:
         super().__init__(simulation)
-        self._label = simulation.label(simulation.scene.episode.target)
+        self._label = simulation.find_label(simulation.scene.episode.target)
         self._largest = 0.0  # m²
         self.fraction = 1.0  # of the area at rest
         self.offset = np.nan  # m, of the vessel from the image's middle; NaN unseen
 
-    def begin(self, state: State) -> None:
+    def begin_episode(self, state: ScanState) -> None:
         """Look for the vessel."""
-        self._look(state)
+        self._measure_vessel(state)
 
-    def _look(self, state: State) -> None:
+    def _measure_vessel(self, state: ScanState) -> None:
         area = self._simulation.pixel_area
-        rest = self._simulation.labels_at_rest(state.pose) == self._label
+        rest = self._simulation.compute_labels_at_rest(state.pose) == self._label
         now = state.labels == self._label
         at_rest = float(rest.sum()) * area
         self._largest = max(self._largest, at_rest)
@@ -88,7 +88,7 @@ class _VesselTask(Task):
         middle = (probe.columns - 1) / 2
         self.offset = float((columns.mean() - middle) * probe.pixel_spacing[0])
 
-    def facts(self) -> dict[str, float]:
+    def collect_facts(self) -> dict[str, float]:
         """Return the area over that at rest, and the offset (m), NaN where it is not in view."""
         return {"target_area_fraction": self.fraction, "target_offset": self.offset}
 
@@ -98,15 +98,15 @@ class FindVein(_VesselTask):
 
     in_short = "the vein within 2 mm of the image's middle, open, the face in contact, for 10 steps"
 
-    def judge(self, state: State) -> tuple[float, float]:
+    def judge_step(self, state: ScanState) -> tuple[float, float]:
         """Reward nearness, and by another half contact that leaves the vein open."""
-        self._look(state)
+        self._measure_vessel(state)
         half = self._simulation.scanner.probe.width / 2
         distance = float(np.fmin(abs(self.offset), half))
         is_open = self.fraction >= _OPEN
         is_right = distance <= 2e-3 and is_open and state.contact >= _TOUCHING
         reward = -0.5 * distance / half - 0.5 * (1.0 - state.contact * is_open)
-        return reward, float(self._hold(is_right, 10))
+        return reward, float(self._has_held(is_right, 10))
 
 
 class CompressVein(_VesselTask):
@@ -114,19 +114,19 @@ class CompressVein(_VesselTask):
 
     in_short = "the vein at 27 % of its area at rest for 5 steps, then open with less than 1 N"
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, simulation: ScanSimulation) -> None:
         super().__init__(simulation)
         self.is_closed = False  # at some time in the episode
 
-    def judge(self, state: State) -> tuple[float, float]:
+    def judge_step(self, state: ScanState) -> tuple[float, float]:
         """Return no reward but the part that is done, which grows the further an episode gets.
 
         Up to 0.1 for contact and 0.2 for less of the vein, 0.5 once it was closed, up to 0.3 more
         for less force, and all of it when the vein is let go.
         """
-        self._look(state)
+        self._measure_vessel(state)
         if not self.is_closed:
-            self.is_closed = self._hold(self.fraction <= WALLS_TOUCH, 5)
+            self.is_closed = self._has_held(self.fraction <= WALLS_TOUCH, 5)
         if not self.is_closed:
             shut = np.clip((1.0 - self.fraction) / (1.0 - WALLS_TOUCH), 0.0, 1.0)
             return 0.0, 0.1 * state.contact + 0.2 * float(shut)
@@ -135,24 +135,24 @@ class CompressVein(_VesselTask):
         pressed = max(state.force, 0.0) / self._simulation.scene.episode.force
         return 0.0, 0.5 + 0.3 * (1.0 - min(pressed, 1.0))
 
-    def facts(self) -> dict[str, float]:
+    def collect_facts(self) -> dict[str, float]:
         """Add whether the vein was closed."""
-        return super().facts() | {"closed": float(self.is_closed)}
+        return super().collect_facts() | {"closed": float(self.is_closed)}
 
 
-class HoldContact(Task):
+class HoldContact(EpisodeTask):
     """Hold a force on the skin."""
 
     in_short = "4 N along the probe's axis, within 20 %, the face in contact, for 60 steps"
 
-    def judge(self, state: State) -> tuple[float, float]:
+    def judge_step(self, state: ScanState) -> tuple[float, float]:
         """Reward nearness to the force."""
         error = abs(state.force - 4.0) / 4.0
         is_right = error <= 0.2 and state.contact >= _TOUCHING
-        return -min(error, 1.0), float(self._hold(is_right, 60))
+        return -min(error, 1.0), float(self._has_held(is_right, 60))
 
 
-class FollowPlane(Task):
+class FollowPlane(EpisodeTask):
     """Follow an image plane that slides along the arm and turns."""
 
     in_short = (
@@ -161,36 +161,36 @@ class FollowPlane(Task):
     )
     has_goal = True
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, simulation: ScanSimulation) -> None:
         super().__init__(simulation)
         probe = simulation.scanner.probe
         x, z = probe.width / 2, probe.depth
         self._corners = np.array([[-x, 0.0, 0.0], [x, 0.0, 0.0], [-x, 0.0, z], [x, 0.0, z]])
         self._start, self._step, self._error = Pose(), 0, 0.0
 
-    def begin(self, state: State) -> None:
+    def begin_episode(self, state: ScanState) -> None:
         """Begin under the probe, pressed by 2 mm and upright."""
         self._start = Pose(np.array([*state.pose.position[:2], 2e-3]))
 
-    def goal(self, step: int) -> Pose:
+    def compute_goal(self, step: int) -> Pose:
         """Return the plane's pose at a step."""
         part = min(step / 200, 1.0)
         turn = np.array([0.0, 0.0, np.deg2rad(10.0) * part])
         return self._start @ Pose(np.array([0.0, 10e-3 * part, 0.0]), rotation_exp(turn))
 
-    def judge(self, state: State) -> tuple[float, float]:
+    def judge_step(self, state: ScanState) -> tuple[float, float]:
         """Reward nearness to the plane."""
         self._step += 1
-        apart: NDArray[np.float64] = self.goal(self._step).apply(self._corners)
-        apart = apart - state.pose.apply(self._corners)
+        apart: NDArray[np.float64] = self.compute_goal(self._step).transform_points(self._corners)
+        apart = apart - state.pose.transform_points(self._corners)
         self._error = float(np.linalg.norm(apart, axis=1).max())
-        return -min(self._error / 0.02, 1.0), float(self._hold(self._error <= 2e-3, 60))
+        return -min(self._error / 0.02, 1.0), float(self._has_held(self._error <= 2e-3, 60))
 
-    def facts(self) -> dict[str, float]:
+    def collect_facts(self) -> dict[str, float]:
         """Return the largest distance (m) of a corner from where it should be."""
         return {"plane_error": self._error}
 
 
-TASKS: dict[str, type[Task]] = {
+TASKS: dict[str, type[EpisodeTask]] = {
     task.__name__: task for task in (FindVein, CompressVein, HoldContact, FollowPlane)
 }

@@ -1,10 +1,10 @@
 """The block of tissue that solvers press and slicers cut, and its meshes.
 
->>> from us_sim.evaluation.block import MESHES, block, graded_planes
->>> mesh = block(MESHES[0])
+>>> from us_sim.evaluation.block import MESHES, make_block_mesh, make_graded_planes
+>>> mesh = make_block_mesh(MESHES[0])
 >>> len(mesh.nodes), len(mesh.tetrahedra)
 (2000, 7695)
->>> graded_planes(0.0, 0.05, 0.0, 0.02, 0.01, 1.2).round(4).tolist()
+>>> make_graded_planes(0.0, 0.05, 0.0, 0.02, 0.01, 1.2).round(4).tolist()
 [0.0, 0.01, 0.02, 0.0336, 0.05]
 """
 
@@ -26,14 +26,14 @@ LARGEST_MESH = (64, 32, 32)  # nodes along x, y and z
 
 
 @cache
-def block(counts: tuple[int, int, int]) -> TetrahedralMesh:
+def make_block_mesh(counts: tuple[int, int, int]) -> TetrahedralMesh:
     """The block at rest, with so many nodes along each axis."""
     return box_mesh(
         *(uniform_planes(*side, count) for side, count in zip(EXTENT, counts, strict=True))
     )
 
 
-def graded_planes(
+def make_graded_planes(
     low: float, high: float, fine_low: float, fine_high: float, size: float, growth: float
 ) -> NDArray[np.float64]:
     """Planes (m) from ``low`` to ``high``: ``size`` apart where it is fine, growing outside.

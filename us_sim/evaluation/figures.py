@@ -1,7 +1,7 @@
 """The three kinds of figure of the reports, each over a pandas DataFrame.
 
 `draw_error_over_time` and `draw_error_over_parameter` have a panel for each value of one column, a
-line for each value of another (its colour and mark are those of `Look`, or the next free ones), and
+line for each value of another (its colour and mark are those of `LineLook`, or the next free ones), and
 the rows' points on it, in the order of x. `draw_image_grid` has a row and a column for each name.
 
 >>> import pandas as pd
@@ -35,7 +35,7 @@ _LIMIT: Mapping[str, Any] = {"color": "0.6", "lw": 1, "ls": ":", "zorder": 0}
 
 
 @dataclass(frozen=True)
-class Look:
+class LineLook:
     """Colour and mark of a line; as Matplotlib names them."""
 
     colour: str
@@ -67,7 +67,7 @@ def draw_lines(
     lines: str = "",
     log: str = "",
     labels: Mapping[str, str] | None = None,
-    looks: Mapping[str, Look] | None = None,
+    looks: Mapping[str, LineLook] | None = None,
     filled: str = "",
     join: bool = True,
     limits: Mapping[str, float] | None = None,
@@ -100,9 +100,9 @@ def draw_lines(
         if colour not in {look.colour for look in looks.values()}
     )
     for name in names:
-        looks.setdefault(name, Look(*next(free)))
+        looks.setdefault(name, LineLook(*next(free)))
     groups = dict(list(table.groupby(panels, sort=False))) if panels else {"": table}
-    figure, axes = _figure(title, len(groups) or 1, 4.2, 3.6, share_y)
+    figure, axes = _make_panels(title, len(groups) or 1, 4.2, 3.6, share_y)
     for panel, (name, points) in zip(axes, groups.items(), strict=False):
         panel.set_title(str(name), fontsize=11, loc="left")
         for line in names:
@@ -137,7 +137,9 @@ def draw_lines(
     keys += [Line2D([], [], **_LIMIT, label=name.removeprefix("y:")) for name in limits]
     if keys:
         beside: Any = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0)}
-        axes[_columns(len(axes)) - 1].legend(handles=keys, fontsize=8, frameon=False, **beside)
+        axes[_count_columns(len(axes)) - 1].legend(
+            handles=keys, fontsize=8, frameon=False, **beside
+        )
     return figure
 
 
@@ -149,7 +151,7 @@ def draw_image_grid(grid: Mapping[str, Mapping[str, NDArray[Any]]], title: str) 
         title: of the figure.
     """
     columns = list(dict.fromkeys(name for row in grid.values() for name in row))
-    figure = _empty(title, 2.7 * len(columns) + 0.9, 2.9 * len(grid) + 0.6)
+    figure = _make_figure(title, 2.7 * len(columns) + 0.9, 2.9 * len(grid) + 0.6)
     axes = figure.subplots(len(grid), len(columns), squeeze=False)
     for panel, column in zip(axes[0], columns, strict=True):
         panel.set_title(column, fontsize=9)
@@ -162,25 +164,25 @@ def draw_image_grid(grid: Mapping[str, Mapping[str, NDArray[Any]]], title: str) 
     return figure
 
 
-def _figure(
+def _make_panels(
     title: str, count: int, width: float, height: float, share_y: bool
 ) -> tuple[Figure, list[Axes]]:
     """A figure with so many panels of a size (inches)."""
-    columns = _columns(count)
+    columns = _count_columns(count)
     rows = -(-count // columns)
-    figure = _empty(title, width * columns + 2.0, height * rows + 0.7)
+    figure = _make_figure(title, width * columns + 2.0, height * rows + 0.7)
     axes = figure.subplots(rows, columns, squeeze=False, sharey=share_y)
     for panel in axes.flat[count:]:
         panel.set_visible(False)
     return figure, list(axes.flat[:count])
 
 
-def _columns(count: int) -> int:
+def _count_columns(count: int) -> int:
     """Panels in a row, of so many."""
     return 2 if count == 4 else min(3, count)
 
 
-def _empty(title: str, width: float, height: float) -> Figure:
+def _make_figure(title: str, width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     figure.set_label(title)

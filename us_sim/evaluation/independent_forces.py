@@ -1,13 +1,13 @@
 """Forces that hold tissue at its displacements, by the equations of each method, in NumPy.
 
 They are written down a second time, in double precision, and share no code with a solver, so
-that rounding and omissions of a solver show: see `least_unbalanced`.
+that rounding and omissions of a solver show: see `bound_imbalance`.
 
 >>> from us_sim.tissue.elasticity.material import Material
 >>> from us_sim.tissue.model import TissueModel
 >>> block = TissueModel.block(nodes=(2, 2, 2), material=Material(10e3, 0.25))
 >>> pulled = block.mesh.nodes * [0.0, 0.0, 0.01]  # one percent of strain along z
->>> forces = hooke_forces(block.mesh, block.materials, pulled)
+>>> forces = compute_hooke_forces(block.mesh, block.materials, pulled)
 >>> f"{forces[block.mesh.nodes[:, 2] > 0.05, 2].sum():.3f} N"  # 1.2 E of strain on 0.01 m2
 '1.200 N'
 """
@@ -35,7 +35,7 @@ _ROUNDED = 10.0
 """How many times the forces of rounding may be those of one random rounding of the nodes."""
 
 
-def least_unbalanced(
+def bound_imbalance(
     model: TissueModel, forces: Forces, deformation: Deformation
 ) -> tuple[float, float, float]:
     """Return what is unbalanced at least, what may be rounding of it, and the load at most, N.
@@ -58,7 +58,7 @@ def least_unbalanced(
     return float(unbalanced), float(rounding), float(load)
 
 
-def hooke_forces(
+def compute_hooke_forces(
     mesh: TetrahedralMesh,
     materials: TissueMaterials,
     displacement: Array,
@@ -72,15 +72,15 @@ def hooke_forces(
     incompressible and nearly incompressible dynamic explicit applications, Commun. Numer. Meth.
     Engng. 14, 1998).
     """
-    shear, own, nodal = _moduli(materials, _ELEMENT_BULK if averaged else np.inf)
+    shear, own, nodal = _split_moduli(materials, _ELEMENT_BULK if averaged else np.inf)
     gradient = _gradients(mesh)
-    slope = _slopes(mesh, gradient, displacement)
-    pressure = (own - shear) * _trace(slope) + _around(mesh, nodal, _trace(slope))
+    slope = _compute_slopes(mesh, gradient, displacement)
+    pressure = (own - shear) * _trace(slope) + _average_around_nodes(mesh, nodal, _trace(slope))
     stress = shear[:, None, None] * (slope + slope.transpose(0, 2, 1))
-    return _gathered(mesh, gradient, stress + pressure[:, None, None] * np.eye(3))
+    return _gather_forces(mesh, gradient, stress + pressure[:, None, None] * np.eye(3))
 
 
-def neo_hookean_forces(
+def compute_neo_hookean_forces(
     mesh: TetrahedralMesh, materials: TissueMaterials, displacement: Array
 ) -> Array:
     """Derivative of the stable neo-Hookean energy with averaged pressures, (N, 3) N; no lumens.
@@ -88,13 +88,13 @@ def neo_hookean_forces(
     (B. Smith, F. de Goes and T. Kim, Stable Neo-Hookean Flesh Simulation, ACM Trans. Graph. 37,
     2018, without its logarithmic barrier.)
     """
-    shear, own, nodal = _moduli(materials, _ELEMENT_BULK)
+    shear, own, nodal = _split_moduli(materials, _ELEMENT_BULK)
     gradient = _gradients(mesh)
-    slope = _slopes(mesh, gradient, displacement)
+    slope = _compute_slopes(mesh, gradient, displacement)
     # J - 1 as a polynomial in the displacement's gradient, so that nothing cancels.
     minors = (_trace(slope) ** 2 - _trace(slope @ slope)) / 2
     swelling = _trace(slope) + minors + np.linalg.det(slope)
-    pressure = own * swelling + _around(mesh, nodal, swelling)
+    pressure = own * swelling + _average_around_nodes(mesh, nodal, swelling)
     pressure += _wall_modulus(mesh, shear) * _crowding(1 + swelling)
     # mu F - mu cof F, again without cancelling: cof F - F = tr(H) I - H' - H + cof H.
     difference = (
@@ -104,10 +104,10 @@ def neo_hookean_forces(
         + _cofactors(slope)
     )
     stress = pressure[:, None, None] * _cofactors(slope + np.eye(3))
-    return _gathered(mesh, gradient, stress - shear[:, None, None] * difference)
+    return _gather_forces(mesh, gradient, stress - shear[:, None, None] * difference)
 
 
-def spring_forces(
+def compute_spring_forces(
     edges: NDArray[np.int32], stiffness: Array, rest: Array, displacement: Array
 ) -> Array:
     """(N, 3) N that hold springs of (E,) N/m along edges (E, 2), undeformed at ``rest`` (N, 3)."""
@@ -124,7 +124,7 @@ def spring_forces(
     return force
 
 
-def _moduli(materials: TissueMaterials, limit: float) -> tuple[Array, Array, Array]:
+def _split_moduli(materials: TissueMaterials, limit: float) -> tuple[Array, Array, Array]:
     """Return mu, and of lambda + mu the elements' part, up to a multiple of mu, and the nodes'."""
     shear = materials.young_modulus / (2 + 2 * materials.poisson_ratio)
     whole = shear / (1 - 2 * materials.poisson_ratio)
@@ -143,7 +143,7 @@ def _gradients(mesh: TetrahedralMesh) -> Array:
     return gradient
 
 
-def _slopes(mesh: TetrahedralMesh, gradient: Array, displacement: Array) -> Array:
+def _compute_slopes(mesh: TetrahedralMesh, gradient: Array, displacement: Array) -> Array:
     """(M, 3, 3) gradient of the displacement, component by direction.
 
     Relative to one corner, so that a displacement of a whole tetrahedron cancels exactly.
@@ -152,14 +152,14 @@ def _slopes(mesh: TetrahedralMesh, gradient: Array, displacement: Array) -> Arra
     return np.einsum("mai,maj->mij", moved - moved[:, :1], gradient)
 
 
-def _gathered(mesh: TetrahedralMesh, gradient: Array, stress: Array) -> Array:
+def _gather_forces(mesh: TetrahedralMesh, gradient: Array, stress: Array) -> Array:
     force = np.zeros((len(mesh.nodes), 3))
     corners = np.einsum("m,mij,maj->mai", mesh.volumes, stress, gradient)
     np.add.at(force, mesh.tetrahedra, corners)
     return force
 
 
-def _around(mesh: TetrahedralMesh, modulus: Array, value: Array) -> Array:
+def _average_around_nodes(mesh: TetrahedralMesh, modulus: Array, value: Array) -> Array:
     """(M,) Pa, a modulus times the mean over the nodes of the weighted means around each node."""
     weight = modulus * mesh.volumes / 4
     total, sum_of = np.zeros(len(mesh.nodes)), np.zeros(len(mesh.nodes))

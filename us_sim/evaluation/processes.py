@@ -1,8 +1,8 @@
 """The simulator in a process of its own: what it sends, its processor time and its memory.
 
 >>> import os
->>> from us_sim.evaluation.processes import usage_of
->>> usage = usage_of(os.getpid())
+>>> from us_sim.evaluation.processes import measure_usage
+>>> usage = measure_usage(os.getpid())
 >>> usage is None or usage["MB"] > 1.0
 True
 """
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from us_sim.evaluation.latency.arrivals import Arrivals
 
 
-def usage_of(pid: int) -> dict[str, float] | None:
+def measure_usage(pid: int) -> dict[str, float] | None:
     """Tell what a process has used until now; None where it has ended, or the system is silent.
 
     Returns:
@@ -61,22 +61,22 @@ class UsageOverTime:
     def update(self) -> None:
         """Note what every process has used until now."""
         passed = time.monotonic() - self._began
-        for pid, name in started_by(self._parent).items():
-            if (usage := usage_of(pid)) is not None:
+        for pid, name in find_descendants(self._parent).items():
+            if (usage := measure_usage(pid)) is not None:
                 self._rows.append({"process": name, "s": passed, **usage})
 
-    def table(self) -> pd.DataFrame:
+    def make_table(self) -> pd.DataFrame:
         """A row a process and moment: ``process``, ``s``, ``processor`` (s) and ``MB``."""
         rows = pd.DataFrame(self._rows, columns=["process", "s", "processor", "MB"])
         return rows.groupby(["process", "s"], sort=False, as_index=False).sum()
 
-    def columns(self) -> dict[str, float]:
+    def make_columns(self) -> dict[str, float]:
         """Cores, memory in the end and its growth after a minute, of every process, for a row.
 
         Growth is by least squares, and NaN in less than two minutes.
         """
         found = {}
-        for name, rows in self.table().groupby("process", sort=False):
+        for name, rows in self.make_table().groupby("process", sort=False):
             passed = float(rows["s"].max() - rows["s"].min())
             worked = float(rows["processor"].iloc[-1] - rows["processor"].iloc[0])
             late = rows[rows["s"] >= rows["s"].min() + 60.0]
@@ -87,7 +87,7 @@ class UsageOverTime:
         return found
 
 
-def started_by(pid: int) -> dict[int, str]:
+def find_descendants(pid: int) -> dict[int, str]:
     """Names of all descendants of a process by their numbers: of a node, or of a program."""
     found: dict[int, str] = {}
     waiting = [pid]
@@ -95,12 +95,12 @@ def started_by(pid: int) -> dict[int, str]:
         with contextlib.suppress(OSError):
             for task in Path(f"/proc/{waiting.pop()}/task").iterdir():
                 for word in (task / "children").read_text(encoding="utf-8").split():
-                    found[int(word)] = _name(int(word))
+                    found[int(word)] = _read_name(int(word))
                     waiting.append(int(word))
     return found
 
 
-def _name(pid: int) -> str:
+def _read_name(pid: int) -> str:
     try:
         words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
     except OSError:
@@ -109,38 +109,38 @@ def _name(pid: int) -> str:
 
 
 @dataclass
-class Simulation:
+class SimulatorProcess:
     """`us-sim` in a process of its own."""
 
     process: subprocess.Popen[bytes]
     output: IO[bytes]
     began: float
 
-    def said(self) -> str:
+    def read_output(self) -> str:
         """Output so far."""
         return Path(self.output.name).read_text(encoding="utf-8", errors="replace")
 
-    def check(self) -> None:
+    def require_running(self) -> None:
         """Raise UsSimError when it has ended."""
         if self.process.poll() is not None:
-            lines = self.said().strip().splitlines()
+            lines = self.read_output().strip().splitlines()
             raise UsSimError(f"us-sim has ended{': ' if lines else ''}{''.join(lines[-1:])}")
 
-    def await_images(self, arrivals: Arrivals) -> None:
+    def await_image(self, arrivals: Arrivals) -> None:
         """Wait for the first image.
 
         Raises:
             UsSimError: the simulation has ended, or no image comes.
         """
-        while not arrivals.heard("ultrasound/image"):
-            self.check()
+        while not arrivals.list_arrivals("ultrasound/image"):
+            self.require_running()
             if time.monotonic() - self.began > 300.0:  # the first run compiles
                 raise UsSimError("no image came in 300 s")
             time.sleep(0.02)
 
 
 @contextlib.contextmanager
-def simulating(*words: str) -> Iterator[Simulation]:
+def run_simulator(*words: str) -> Iterator[SimulatorProcess]:
     """Run `us-sim` with these words until the context is left, which interrupts it."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(part for part in sys.path if part)}
     with tempfile.NamedTemporaryFile(prefix="us_sim_evaluate_") as output:
@@ -152,7 +152,7 @@ def simulating(*words: str) -> Iterator[Simulation]:
             stderr=subprocess.STDOUT,
         )
         try:
-            yield Simulation(process, output, began)
+            yield SimulatorProcess(process, output, began)
         finally:
             process.send_signal(signal.SIGINT)
             try:
@@ -163,7 +163,7 @@ def simulating(*words: str) -> Iterator[Simulation]:
 
 
 @contextlib.contextmanager
-def listening() -> Iterator[Arrivals]:
+def record_arrivals() -> Iterator[Arrivals]:
     """Note arrivals, in a thread of this process, until the context is left."""
     import rclpy
     from rclpy.context import Context
@@ -171,21 +171,21 @@ def listening() -> Iterator[Arrivals]:
     from rclpy.signals import SignalHandlerOptions
 
     from us_sim.evaluation.latency.arrivals import Arrivals
-    from us_sim.nodes.process import go_first
+    from us_sim.nodes.process import raise_priority
 
     context = Context()
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     node = Arrivals(context=context)
 
-    def spin() -> None:
+    def spin_node() -> None:
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)
         with contextlib.suppress(ExternalShutdownException):
             executor.spin()
 
-    thread = threading.Thread(target=spin, daemon=True)
+    thread = threading.Thread(target=spin_node, daemon=True)
     thread.start()
-    go_first(2)  # the graph's wait for a core is measured, not the listener's for the nodes
+    raise_priority(2)  # the graph's wait for a core is measured, not the listener's for the nodes
     try:
         yield node
     finally:

@@ -1,12 +1,12 @@
 """What the reports of all subjects say in the same way: tables, percentiles, laws, the machine.
 
->>> from us_sim.evaluation.report import exponent, markdown_table
->>> print(markdown_table(("method", "ms"), [("fem", "0.1235"), ("msds", "12")]))
+>>> from us_sim.evaluation.report import fit_exponent, format_markdown_table
+>>> print(format_markdown_table(("method", "ms"), [("fem", "0.1235"), ("msds", "12")]))
 | method | ms     |
 | ------ | ------ |
 | fem    | 0.1235 |
 | msds   | 12     |
->>> round(exponent({10: 2.0, 20: 8.0, 40: 32.0}), 3)
+>>> round(fit_exponent({10: 2.0, 20: 8.0, 40: 32.0}), 3)
 2.0
 """
 
@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 
-def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def format_markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table whose columns stand below each other; every row has as many cells as the head."""
     widths = [max(len(cell) for cell in column) for column in zip(head, *rows, strict=True)]
     lines = [head, ["-" * max(width, 1) for width in widths], *rows]
@@ -31,12 +31,12 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     )
 
 
-def percentile(values: Sequence[float] | np.ndarray, percent: float) -> float:
+def compute_percentile(values: Sequence[float] | np.ndarray, percent: float) -> float:
     """A percentile; NaN of no values."""
     return float(np.percentile(values, percent)) if len(values) else float("nan")
 
 
-def exponent(cost_of_size: Mapping[float, float]) -> float:
+def fit_exponent(cost_of_size: Mapping[float, float]) -> float:
     """k in cost ~ size^k, by least squares of the logarithms; NaN with fewer than two sizes.
 
     Costs that are not positive and finite are left out.
@@ -47,7 +47,7 @@ def exponent(cost_of_size: Mapping[float, float]) -> float:
     return float(np.polyfit(np.log(list(known)), np.log(list(known.values())), 1)[0])
 
 
-def machine(*libraries: str) -> str:
+def describe_machine(*libraries: str) -> str:
     """Name processor, cores, system, and the versions of Python and of the libraries it has."""
     processor = platform.processor() or platform.machine()
     try:

@@ -21,10 +21,10 @@ registry's target is the `Subject`, which is called with the folder, ``quick``, 
 settings if it has some; these go to ``pieces``, too. It prints the lines to take home and returns 1
 where something failed.
 
->>> from us_sim.evaluation.subject import Target, markdown_of
+>>> from us_sim.evaluation.subject import Target, format_data_frame
 >>> Target.at_most("an image", 2.0, 1.5, "ms").cells
 ('an image', 'at most 2 ms', '1.5 ms', 'yes')
->>> print(markdown_of(pd.DataFrame([{"method": "fem", "ms": 0.123456}, {"method": "msds"}])))
+>>> print(format_data_frame(pd.DataFrame([{"method": "fem", "ms": 0.123456}, {"method": "msds"}])))
 | method | ms    |
 | ------ | ----- |
 | fem    | 0.123 |
@@ -47,7 +47,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.report import machine, markdown_table
+from us_sim.evaluation.report import describe_machine, format_markdown_table
 from us_sim.progress import Progress
 
 Place: TypeAlias = "str | Sequence[str] | pd.DataFrame | Figure"
@@ -63,7 +63,7 @@ class Piece:
     def __str__(self) -> str:
         if "case" in self.case:
             return str(self.case["case"])
-        return ", ".join(_cell(value, ".4g") for value in list(self.case.values())[:4])
+        return ", ".join(_format_cell(value, ".4g") for value in list(self.case.values())[:4])
 
 
 @dataclass(frozen=True)
@@ -78,15 +78,15 @@ class Target:
     @classmethod
     def at_most(cls, what: str, limit: float, seen: float, unit: str = "") -> Target:
         """A limit from above; ``seen`` is NaN where it was not measured."""
-        return cls._limit(what, f"at most {limit:g}", seen, seen <= limit, unit)
+        return cls._make_limit(what, f"at most {limit:g}", seen, seen <= limit, unit)
 
     @classmethod
     def at_least(cls, what: str, limit: float, seen: float, unit: str = "") -> Target:
         """A limit from below; likewise."""
-        return cls._limit(what, f"at least {limit:g}", seen, seen >= limit, unit)
+        return cls._make_limit(what, f"at least {limit:g}", seen, seen >= limit, unit)
 
     @classmethod
-    def _limit(cls, what: str, asked: str, seen: float, met: bool, unit: str) -> Target:
+    def _make_limit(cls, what: str, asked: str, seen: float, met: bool, unit: str) -> Target:
         unit = unit and f" {unit}"
         if not np.isfinite(seen):
             return cls(what, asked + unit)
@@ -156,13 +156,13 @@ class Subject:
         )
         parts = (
             f"# {self.title}",
-            _text_of(report.take_home),
-            f"`{command}`, {seconds:.0f} s, on {machine(*self.libraries)}. "
+            _format_place(report.take_home),
+            f"`{command}`, {seconds:.0f} s, on {describe_machine(*self.libraries)}. "
             f"Every row is in {files}.",
-            _text_of(targets),
+            _format_place(targets),
             self._fill_page(out, report.places),
             "## Failed" if failures else "",
-            _text_of(failures),
+            _format_place(failures),
         )
         page.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
         print("\n".join([*report.take_home, f"Report: {page}"]))
@@ -173,7 +173,7 @@ class Subject:
     def _write_csv(self, file: Path, table: pd.DataFrame) -> None:
         shown = table.drop(columns=[name for name in self.hidden if name in table])
         # Counts that some rows lack are counts all the same.
-        cells = shown.convert_dtypes().map(lambda value: _cell(value, f".{self.digits}g"))
+        cells = shown.convert_dtypes().map(lambda value: _format_cell(value, f".{self.digits}g"))
         cells.to_csv(file, index=False, lineterminator="\n")
 
     def _fill_page(self, out: Path, places: Mapping[str, Place]) -> str:
@@ -185,7 +185,7 @@ class Subject:
                 place.savefig(picture, dpi=110)
                 filled[name] = f"![{place.get_label()}]({picture.name})"
             else:
-                filled[name] = _text_of(place)
+                filled[name] = _format_place(place)
         text = Path(__file__).with_name(self.name).joinpath("report.md").read_text(encoding="utf-8")
         sections = []
         for section in re.split(r"\n(?=## )", text):
@@ -195,13 +195,13 @@ class Subject:
         return re.sub(r"\n{3,}", "\n\n", "\n\n".join(sections))
 
 
-def markdown_of(table: pd.DataFrame, form: str = ".3g") -> str:
+def format_data_frame(table: pd.DataFrame, form: str = ".3g") -> str:
     """Write a table in Markdown, its floats in a format; what is not known is empty."""
-    rows = [[_cell(value, form) for value in row] for row in table.astype(object).to_numpy()]
-    return markdown_table([str(name) for name in table.columns], rows) if rows else ""
+    rows = [[_format_cell(value, form) for value in row] for row in table.astype(object).to_numpy()]
+    return format_markdown_table([str(name) for name in table.columns], rows) if rows else ""
 
 
-def _cell(value: Any, form: str) -> str:
+def _format_cell(value: Any, form: str) -> str:
     if isinstance(value, bool | np.bool_):
         return str(value).lower()
     if value is None or value is pd.NA or value != value:  # NaN is no number that equals itself
@@ -209,9 +209,9 @@ def _cell(value: Any, form: str) -> str:
     return f"{value:{form}}" if isinstance(value, float | np.floating) else str(value)
 
 
-def _text_of(place: str | Sequence[str] | pd.DataFrame) -> str:
+def _format_place(place: str | Sequence[str] | pd.DataFrame) -> str:
     if isinstance(place, pd.DataFrame):
-        return markdown_of(place)
+        return format_data_frame(place)
     if isinstance(place, str):
         return place
     return "\n".join(f"- {line}" for line in place)

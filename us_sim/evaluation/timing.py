@@ -11,7 +11,7 @@ import numpy as np
 C = TypeVar("C")
 
 
-def medians_in_turn(
+def time_in_turn(
     work: Mapping[str, Callable[[Any], object]],
     count: int,
     uncounted: int,

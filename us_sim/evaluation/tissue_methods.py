@@ -12,21 +12,21 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, TypeAlias
 
-from us_sim.evaluation.figures import Look
+from us_sim.evaluation.figures import LineLook
 from us_sim.evaluation.independent_forces import (
     Forces,
-    hooke_forces,
-    neo_hookean_forces,
-    spring_forces,
+    compute_hooke_forces,
+    compute_neo_hookean_forces,
+    compute_spring_forces,
 )
-from us_sim.tissue.elasticity.springs import springs_of
+from us_sim.tissue.elasticity.springs import build_springs
 from us_sim.tissue.model import TissueModel
 
 Setting: TypeAlias = Mapping[str, Any]  # values of some of a solver's settings, by name
 
 
 @dataclass(frozen=True)
-class TissueMethod:
+class EvaluatedMethod:
     """One solver."""
 
     name: str
@@ -44,25 +44,27 @@ class TissueMethod:
         return ({}, *self.tried)
 
 
-def _spring_equations(model: TissueModel) -> Forces:
+def _make_spring_equations(model: TissueModel) -> Forces:
     """Write down the forces of the springs of Algorithm 1."""
-    springs = springs_of(model.mesh, model.materials)
-    return lambda displacement: spring_forces(
+    springs = build_springs(model.mesh, model.materials)
+    return lambda displacement: compute_spring_forces(
         springs.edges, springs.stiffness, model.mesh.nodes, displacement
     )
 
 
-def _solid_equations(forces: Callable[..., Any]) -> Callable[[TissueModel], Forces]:
+def _make_solid_equations(forces: Callable[..., Any]) -> Callable[[TissueModel], Forces]:
     return lambda model: partial(forces, model.mesh, model.materials)
 
 
 _ALL = (
-    TissueMethod("fem", "#0072B2", "o", _solid_equations(partial(hooke_forces, averaged=True))),
-    TissueMethod(
+    EvaluatedMethod(
+        "fem", "#0072B2", "o", _make_solid_equations(partial(compute_hooke_forces, averaged=True))
+    ),
+    EvaluatedMethod(
         "fem_nonlinear",
         colour="#D55E00",
         mark="D",
-        equations=_solid_equations(neo_hookean_forces),
+        equations=_make_solid_equations(compute_neo_hookean_forces),
         is_judged_at_rest=True,
         patient={"frame_tolerance": 1e-7, "most_iterations": 4000, "tolerance": 1e-7},
         tried=(
@@ -72,18 +74,18 @@ _ALL = (
             {"frame_tolerance": 0.001, "most_iterations": 1000},
         ),
     ),
-    TissueMethod(
+    EvaluatedMethod(
         "fem_cg",
         colour="#56B4E9",
         mark="s",
-        equations=_solid_equations(hooke_forces),
+        equations=_make_solid_equations(compute_hooke_forces),
         tried=tuple({"iterations": n} for n in (5, 10, 40, 80, 160)),
     ),
-    TissueMethod(
+    EvaluatedMethod(
         "msds",
         colour="#009E73",
         mark="^",
-        equations=_spring_equations,
+        equations=_make_spring_equations,
         tried=({"steps": 5}, {"steps": 80}, {"stiffness": "fitted"}),
         is_dynamic=True,
     ),
@@ -91,5 +93,5 @@ _ALL = (
 TISSUE_METHODS = {method.name: method for method in _ALL}
 """By name, in the reports' order; colours are told apart in every common colour blindness."""
 
-LOOKS = {method.name: Look(method.colour, method.mark) for method in _ALL}
+LOOKS = {method.name: LineLook(method.colour, method.mark) for method in _ALL}
 """Of each method's line in a figure."""

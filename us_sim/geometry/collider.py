@@ -69,7 +69,7 @@ class RoundedBox(_Shape):
         """Refuse dimensions that do not go together."""
         smallest = min(self.length, self.width, self.height)
         if 2 * self.rounding > smallest:
-            raise self.refused(
+            raise self.make_error(
                 "rounding",
                 f"{self.rounding:g} m is more than half of the smallest side ({smallest:g} m): "
                 f"give at most {smallest / 2:g} m",
@@ -92,10 +92,10 @@ class Convex(RoundedBox):
         super().check()
         core = self.radius - self.rounding
         if core <= 0.0:
-            raise self.refused("radius", f"{self.radius:g} m is no more than the rounding")
+            raise self.make_error("radius", f"{self.radius:g} m is no more than the rounding")
         longest = 2 * (core * math.sin(_STEEPEST) + self.rounding)
         if self.length > longest:
-            raise self.refused(
+            raise self.make_error(
                 "length",
                 f"{self.length:g} m: a face of radius {self.radius:g} m would be steeper than "
                 f"{math.degrees(_STEEPEST):g} degrees at its ends: give at most {longest:.4g} m",
@@ -103,7 +103,7 @@ class Convex(RoundedBox):
         half = 0.5 * self.length - self.rounding
         least = 2 * self.rounding + core - math.sqrt(core * core - half * half)
         if self.height < least:
-            raise self.refused(
+            raise self.make_error(
                 "height",
                 f"{self.height:g} m is less than the face is bent: give at least {least:.4g} m",
             )

@@ -2,9 +2,9 @@
 
 >>> import numpy as np
 >>> from us_sim.geometry.collider import Sphere
->>> from us_sim.geometry.collider_distance import signed_distance
+>>> from us_sim.geometry.collider_distance import measure_distances
 >>> from us_sim.geometry.pose import Pose
->>> signed_distance(Sphere(0.03), Pose(), np.array([[0.0, 0.0, 0.01]]))
+>>> measure_distances(Sphere(0.03), Pose(), np.array([[0.0, 0.0, 0.01]]))
 (array([0.01]), array([[0., 0., 1.]]))
 """
 
@@ -21,7 +21,7 @@ from us_sim.kernels import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def rotate(r, x, y, z):
+def rotate_vector(r, x, y, z):
     """The matrix r (3, 3) times a vector: from the child's frame to the parent's."""
     return (
         r[0, 0] * x + r[0, 1] * y + r[0, 2] * z,
@@ -31,7 +31,7 @@ def rotate(r, x, y, z):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def rotate_back(r, x, y, z):
+def rotate_vector_back(r, x, y, z):
     """Its transpose times a vector: from the parent's frame to the child's."""
     return (
         r[0, 0] * x + r[1, 0] * y + r[2, 0] * z,
@@ -40,7 +40,7 @@ def rotate_back(r, x, y, z):
     )
 
 
-def signed_distance(
+def measure_distances(
     collider: Collider, pose: Pose, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Measure the distance of points to the collider's surface, and its outward normal there.
@@ -68,13 +68,13 @@ def signed_distance(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def offset_box_distance(box, x, y, z):
+def measure_box_distance(box, x, y, z):
     """Distance and normal for one point of frame ``probe``: (distance, nx, ny, nz).
 
     ``box`` is a collider's ``offset_box``; its foremost face is z = 0.
     """
     if len(box) > 4:
-        return curved_box_distance(box, 0.0, x, y, z)
+        return measure_curved_box_distance(box, 0.0, x, y, z)
     z = z + box[2] + box[3]
     dx = abs(x) - box[0]
     dy = abs(y) - box[1]
@@ -96,8 +96,8 @@ def offset_box_distance(box, x, y, z):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def curved_box_distance(box, grip, x, y, z):
-    """As `offset_box_distance`, of a box with a curved front that goes on behind by ``grip`` m."""
+def measure_curved_box_distance(box, grip, x, y, z):
+    """As `measure_box_distance`, of a box with a curved front that goes on behind by ``grip`` m."""
     radius = 1.0 / box[4]
     end = math.sqrt(radius * radius - box[0] * box[0])  # of the arc, above its centre
     ahead = z + box[3]  # of the foremost point of the core
@@ -143,7 +143,7 @@ def _signed_distances(box, rotation, origin, points, distance, normal):
         a = points[i, 0] - origin[0]
         b = points[i, 1] - origin[1]
         c = points[i, 2] - origin[2]
-        x, y, z = rotate_back(r, a, b, c)
-        d, nx, ny, nz = offset_box_distance(box, x, y, z)
+        x, y, z = rotate_vector_back(r, a, b, c)
+        d, nx, ny, nz = measure_box_distance(box, x, y, z)
         distance[i] = d
-        normal[i, 0], normal[i, 1], normal[i, 2] = rotate(r, nx, ny, nz)
+        normal[i, 0], normal[i, 1], normal[i, 2] = rotate_vector(r, nx, ny, nz)

@@ -3,9 +3,9 @@
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.geometry.frame_chain import FrameChain
 >>> chain = FrameChain("tool", "world")
->>> chain.move("base", "world", 0, Pose([0.0, 0.0, 0.0]))
->>> chain.move("base", "world", 2_000_000_000, Pose([0.2, 0.0, 0.0]))
->>> stamp, pose = chain.move("tool", "base", 1_000_000_000, Pose([0.0, 0.0, 0.3]))
+>>> chain.update_link("base", "world", 0, Pose([0.0, 0.0, 0.0]))
+>>> chain.update_link("base", "world", 2_000_000_000, Pose([0.2, 0.0, 0.0]))
+>>> stamp, pose = chain.update_link("tool", "base", 1_000_000_000, Pose([0.0, 0.0, 0.3]))
 >>> stamp, pose.position
 (1000000000, array([0.1, 0. , 0.3]))
 """
@@ -16,7 +16,7 @@ from bisect import bisect_left
 from collections import deque
 
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.se3 import interpolate
+from us_sim.geometry.se3 import interpolate_poses
 
 _REMEMBERED = 4096  # poses, 4 s of 1 kHz and 20 s of 200 Hz
 _RESTART = 1_000_000_000  # ns that a stamp jumps back by when its source begins again
@@ -34,7 +34,7 @@ class PoseHistory:
         self.stamps: deque[int] = deque(maxlen=_REMEMBERED)  # ns, ascending
         self.poses: deque[Pose] = deque(maxlen=_REMEMBERED)
 
-    def add(self, stamp: int, pose: Pose) -> None:
+    def append_pose(self, stamp: int, pose: Pose) -> None:
         """Take a pose that is newer than all before."""
         self.stamps.append(stamp)
         self.poses.append(pose)
@@ -44,7 +44,7 @@ class PoseHistory:
         self.stamps.clear()
         self.poses.clear()
 
-    def at(self, stamp: int) -> Pose | None:
+    def interpolate_at(self, stamp: int) -> Pose | None:
         """Interpolate the pose at a stamp; None where it is not known."""
         k = bisect_left(self.stamps, stamp)
         if k < len(self.stamps) and self.stamps[k] == stamp:
@@ -55,7 +55,7 @@ class PoseHistory:
         if self._longest is not None and after - before > self._longest:
             return None
         fraction = (stamp - before) / (after - before)
-        return interpolate(self.poses[k - 1], self.poses[k], fraction)
+        return interpolate_poses(self.poses[k - 1], self.poses[k], fraction)
 
 
 class FrameChain:
@@ -75,7 +75,7 @@ class FrameChain:
         self._links: dict[str, tuple[str, Pose | PoseHistory]] = {}  # by frame, with its parent
         self._newest: int | None = None  # ns, of the last pose
 
-    def links(self) -> list[str] | None:
+    def find_links(self) -> list[str] | None:
         """Return the frames from the lowest up to below the top; None while they do not meet."""
         found: list[str] = []
         frame = self._frame
@@ -86,28 +86,30 @@ class FrameChain:
             frame = self._links[frame][0]
         return found
 
-    def _moving(self) -> dict[str, PoseHistory]:
+    def _find_moving_links(self) -> dict[str, PoseHistory]:
         """Return the links on the way that are not fixed."""
-        links = {link: self._links[link][1] for link in self.links() or ()}
+        links = {link: self._links[link][1] for link in self.find_links() or ()}
         return {link: each for link, each in links.items() if isinstance(each, PoseHistory)}
 
     @property
     def is_fixed(self) -> bool:
         """Whether there is a way, and nothing on it moves."""
-        return self.links() is not None and not self._moving()
+        return self.find_links() is not None and not self._find_moving_links()
 
-    def restart(self) -> None:
+    def forget_motion(self) -> None:
         """Forget what moved."""
         self._newest = None
         for _, link in self._links.values():
             if isinstance(link, PoseHistory):
                 link.clear()
 
-    def fix(self, frame: str, parent: str, pose: Pose) -> None:
+    def set_fixed_link(self, frame: str, parent: str, pose: Pose) -> None:
         """Put a frame for good at a pose in its parent."""
         self._links[frame] = parent, pose
 
-    def move(self, frame: str, parent: str, stamp: int, pose: Pose) -> tuple[int, Pose] | None:
+    def update_link(
+        self, frame: str, parent: str, stamp: int, pose: Pose
+    ) -> tuple[int, Pose] | None:
         """Take a frame's pose in its parent at a stamp, ns.
 
         Returns:
@@ -121,13 +123,13 @@ class FrameChain:
         if history.stamps and stamp <= history.stamps[-1]:
             if stamp > history.stamps[-1] - _RESTART:
                 return None
-            self.restart()
-        history.add(stamp, pose)
-        links = self.links()
-        return self._composed(links) if links is not None and frame in links else None
+            self.forget_motion()
+        history.append_pose(stamp, pose)
+        links = self.find_links()
+        return self._compose_links(links) if links is not None and frame in links else None
 
-    def _composed(self, links: list[str]) -> tuple[int, Pose] | None:
-        moving = self._moving().values()
+    def _compose_links(self, links: list[str]) -> tuple[int, Pose] | None:
+        moving = self._find_moving_links().values()
         if not all(each.stamps for each in moving):
             return None
         stamp = min(each.stamps[-1] for each in moving)
@@ -136,16 +138,18 @@ class FrameChain:
         found = Pose()
         for link in links:
             _, place = self._links[link]
-            pose = place.at(stamp) if isinstance(place, PoseHistory) else place
+            pose = place.interpolate_at(stamp) if isinstance(place, PoseHistory) else place
             if pose is None:
                 return None
             found = pose @ found
         self._newest = stamp
         return stamp, found
 
-    def lag(self) -> tuple[str, float]:
+    def find_slowest_link(self) -> tuple[str, float]:
         """Return the link whose newest stamp is the oldest, and the s by which another is newer."""
-        newest = {link: each.stamps[-1] for link, each in self._moving().items() if each.stamps}
+        newest = {
+            link: each.stamps[-1] for link, each in self._find_moving_links().items() if each.stamps
+        }
         if not newest:
             return "", 0.0
         last = min(newest, key=newest.__getitem__)

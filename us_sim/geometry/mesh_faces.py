@@ -10,7 +10,7 @@ FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 MOST_NODES = 2**21  # Most nodes of a mesh, so that the three of a face fit into one 64-bit number
 
 
-def face_order(
+def sort_faces(
     tetrahedra: NDArray[np.integer],
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """Face numbers in an order that groups the faces of the same three nodes.
@@ -29,13 +29,13 @@ def face_order(
     return order, starts, np.diff(np.append(starts, len(keys)))
 
 
-def boundary_triangles(tetrahedra: NDArray[np.integer]) -> NDArray[np.int32]:
+def find_boundary_triangles(tetrahedra: NDArray[np.integer]) -> NDArray[np.int32]:
     """(F, 3) triangles that belong to one tetrahedron only, normals pointing outward."""
-    faces = tetrahedra[:, FACES].reshape(-1, 3)[boundary_faces(tetrahedra)]
+    faces = tetrahedra[:, FACES].reshape(-1, 3)[find_boundary_faces(tetrahedra)]
     return np.ascontiguousarray(faces, dtype=np.int32)
 
 
-def boundary_faces(tetrahedra: NDArray[np.integer]) -> NDArray[np.intp]:
-    """(F,) ascending numbers, as in `face_order`, of the faces of one tetrahedron only."""
-    order, starts, counts = face_order(tetrahedra)
+def find_boundary_faces(tetrahedra: NDArray[np.integer]) -> NDArray[np.intp]:
+    """(F,) ascending numbers, as in `sort_faces`, of the faces of one tetrahedron only."""
+    order, starts, counts = sort_faces(tetrahedra)
     return np.sort(order[starts[counts == 1]])

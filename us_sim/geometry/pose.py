@@ -3,7 +3,7 @@
 >>> import numpy as np
 >>> from us_sim.geometry.pose import Pose
 >>> pressed = Pose(position=[0.0, 0.0, 0.012], orientation=[0.0, 0.0, 0.0, 1.0])
->>> pressed.apply(np.array([[0.0, 0.0, 0.03]]))
+>>> pressed.transform_points(np.array([[0.0, 0.0, 0.03]]))
 array([[0.   , 0.   , 0.042]])
 """
 
@@ -103,7 +103,7 @@ class Pose:
         matrix[:3, 3] = self.position
         return matrix
 
-    def apply(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def transform_points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (N, 3) m of the child frame, in the parent frame."""
         return points @ self.rotation.T + self.position
 
@@ -113,11 +113,13 @@ class Pose:
 
     def __matmul__(self, other: Pose) -> Pose:
         """The transform that does ``other`` first, then this."""
-        turn = product(self.orientation, other.orientation)
+        turn = multiply_quaternions(self.orientation, other.orientation)
         return Pose(self.rotation @ other.position + self.position, turn)
 
 
-def product(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+def multiply_quaternions(
+    first: NDArray[np.float64], second: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Quaternion (4,) x, y, z, w that rotates by the second, then by the first."""
     x1, y1, z1, w1 = first.tolist()
     x2, y2, z2, w2 = second.tolist()
@@ -131,7 +133,7 @@ def product(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[
     )
 
 
-def same_pose(a: Pose | None, b: Pose | None) -> bool:
+def is_same_pose(a: Pose | None, b: Pose | None) -> bool:
     """Whether two poses are the same, to the last bit."""
     if a is None or b is None:
         return a is b
@@ -153,7 +155,7 @@ class Placement(Settings):
     def check(self) -> None:
         """Refuse a quaternion that is no rotation."""
         if math.hypot(*self.orientation) < 1e-6:
-            raise self.refused(
+            raise self.make_error(
                 "orientation", "is zero, so it is no orientation: give [0, 0, 0, 1] for none"
             )
 

@@ -10,7 +10,7 @@ from math import atan2, cos, sin, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.geometry.pose import Pose, product
+from us_sim.geometry.pose import Pose, multiply_quaternions
 
 _SMALL = 1e-3  # rad: below it series to the fourth order are exact to rounding
 
@@ -30,12 +30,12 @@ def adjoint(pose: Pose) -> NDArray[np.float64]:
     return matrix
 
 
-def interpolate(first: Pose, second: Pose, fraction: float) -> Pose:
+def interpolate_poses(first: Pose, second: Pose, fraction: float) -> Pose:
     """The pose at a fraction (0 to 1) of the path, which is straight and takes the shorter turn."""
     turn = fraction * rotation_between(first.orientation, second.orientation)
     return Pose(
         first.position + fraction * (second.position - first.position),
-        product(rotation_exp(turn), first.orientation),
+        multiply_quaternions(rotation_exp(turn), first.orientation),
     )
 
 
@@ -63,7 +63,7 @@ def rotation_between(
 ) -> NDArray[np.float64]:
     """Rotation vector (3,) rad about the parent's axes that turns the first into the second."""
     x, y, z, w = first.tolist()
-    return rotation_log(product(second, np.array([-x, -y, -z, w])))
+    return rotation_log(multiply_quaternions(second, np.array([-x, -y, -z, w])))
 
 
 def left_jacobian(vector: NDArray[np.float64]) -> NDArray[np.float64]:

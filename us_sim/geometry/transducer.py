@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import SceneError
 from us_sim.geometry.collider import Collider
-from us_sim.settings.choice import Chosen
+from us_sim.settings.choice import ChosenOption
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import COLLIDERS, PROBES
 from us_sim.settings.setting import Settings, setting
@@ -29,8 +29,11 @@ class ProbeSettings(Settings):
     section = "probe"
     error = SceneError
 
-    array: Chosen = setting(
-        description="kind of transducer", choice=PROBES, place="beside", default=Chosen("linear")
+    array: ChosenOption = setting(
+        description="kind of transducer",
+        choice=PROBES,
+        place="beside",
+        default=ChosenOption("linear"),
     )
     image: tuple[int, int] | int | None = setting(
         Quantity("number", 1, 4096),
@@ -38,7 +41,7 @@ class ProbeSettings(Settings):
         "linear array, else 512",
         default=None,
     )
-    collider: Chosen | None = setting(
+    collider: ChosenOption | None = setting(
         description="shape that presses", choice=COLLIDERS, default=None
     )
 
@@ -71,7 +74,7 @@ class TransducerPart:
     triangles: NDArray[np.int32]  # (T, 3), counter-clockwise seen from outside
 
 
-def transducer_mesh(collider: Collider) -> list[TransducerPart]:
+def build_transducer_mesh(collider: Collider) -> list[TransducerPart]:
     """The parts of a transducer whose face has the shape of ``collider``."""
     box = collider.offset_box
     half_x, half_y, rounding = float(box[0]), float(box[1]), float(box[3])
@@ -105,15 +108,15 @@ def transducer_mesh(collider: Collider) -> list[TransducerPart]:
         half_turn
         * (
             np.array([grip_x + high * scale, 0.0, middle])
-            + _turned(_flat_ring(0, 0, wide, 0), size)
+            + _turn_ring(_flat_ring(0, 0, wide, 0), size)
         )
         for scale, size in ((-0.8, (1.0, long / wide)), (0.2, (1.0, long / wide)), (1.0, (0.6, 3)))
     ]
     return [
-        _part("face", FACE, [*front, side, nose], has_front=False),
-        _part("housing", HOUSING, housing),
-        _part("cable", CABLE, cable),
-        _part("notch", NOTCH, notch),
+        _build_part("face", FACE, [*front, side, nose], has_front=False),
+        _build_part("housing", HOUSING, housing),
+        _build_part("cable", CABLE, cable),
+        _build_part("notch", NOTCH, notch),
     ]
 
 
@@ -167,12 +170,12 @@ def _face_rings(
     return rings[:-1], rings[-1]
 
 
-def _turned(ring: NDArray[np.float64], scale: tuple[float, float]) -> NDArray[np.float64]:
+def _turn_ring(ring: NDArray[np.float64], scale: tuple[float, float]) -> NDArray[np.float64]:
     """A ring around z as one around x, its sizes along y and z scaled."""
     return np.column_stack([ring[:, 2], -ring[:, 0] * scale[0], ring[:, 1] * scale[1]])
 
 
-def _part(
+def _build_part(
     name: str, colour: Colour, rings: Sequence[NDArray], has_front: bool = True
 ) -> TransducerPart:
     """Bands from ring to ring, and flat ends; points that are at the same place are one.
@@ -194,10 +197,10 @@ def _part(
         triangles.append(np.column_stack([np.full(count, first), there, here]))
     back = (len(rings) - 1) * count
     triangles.append(np.column_stack([np.full(count, last), back + here, back + there]))
-    return TransducerPart(name, colour, *_joined(vertices, np.concatenate(triangles)))
+    return TransducerPart(name, colour, *_merge_vertices(vertices, np.concatenate(triangles)))
 
 
-def _joined(vertices: NDArray, triangles: NDArray) -> tuple[NDArray, NDArray]:
+def _merge_vertices(vertices: NDArray, triangles: NDArray) -> tuple[NDArray, NDArray]:
     """The same with points that lie on each other, to a nanometre, as one."""
     _, first, which = np.unique(
         np.rint(vertices * 1e9), axis=0, return_index=True, return_inverse=True

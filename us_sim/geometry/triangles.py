@@ -20,7 +20,7 @@ from us_sim.kernels import njit
 _Real = TypeVar("_Real", np.float32, np.float64)
 
 
-def vertex_normals(vertices: NDArray[_Real], triangles: ArrayLike) -> NDArray[_Real]:
+def compute_vertex_normals(vertices: NDArray[_Real], triangles: ArrayLike) -> NDArray[_Real]:
     """(N, 3) unit normals: sums of the adjacent triangles' normals weighted by their area.
 
     They point to the side from which the triangles turn anticlockwise. Where the sum is zero, so
@@ -69,7 +69,7 @@ def _sum_normals(vertices, triangles, normals):
 _FELT, _FINEST = 1.0, 0.25
 
 
-def part_size(rounding: float, spacing: float) -> float:
+def choose_part_size(rounding: float, spacing: float) -> float:
     """m, the longest side of a triangle's parts, for a probe of some rounding (m) and vertices that
     are ``spacing`` (m) apart.
     """

@@ -79,7 +79,7 @@ def announce_often() -> None:
     os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile))
 
 
-def ros_refusal(error: Exception) -> UsSimError:
+def explain_ros_error(error: Exception) -> UsSimError:
     """Return what rcl refused as one sentence, with what a secured domain needs."""
     sentence = f"ROS cannot be used: {' '.join(str(error).split())}"
     if os.environ.get("ROS_SECURITY_ENABLE") == "true":

@@ -16,7 +16,7 @@ from std_msgs.msg import Header
 from us_sim.errors import TrackingError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import image_message, stamp_message
-from us_sim.nodes.parameters import declared
+from us_sim.nodes.parameters import declare_settings
 from us_sim.nodes.process import node_main
 from us_sim.nodes.settings import CameraDriverSettings
 from us_sim.share import full_path
@@ -39,7 +39,7 @@ class CameraDriver(GuardedNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("camera_driver", **kwargs)
-        settings = declared(self, CameraDriverSettings())
+        settings = declare_settings(self, CameraDriverSettings())
         source, info = settings.source, settings.camera_info
         self._frame, self._loop = settings.frame_id, settings.loop
         self._encoding = settings.encoding
@@ -49,15 +49,15 @@ class CameraDriver(GuardedNode):
         self._video = VideoSource(source, size=size, rate=settings.rate)
         self.finished = Future()
         self.health = Health(self, source)
-        self._images = self.stream(Image, "camera/image_raw")
-        self._descriptions = self.stream(CameraInfo, "camera/camera_info")
+        self._images = self.create_stream_publisher(Image, "camera/image_raw")
+        self._descriptions = self.create_stream_publisher(CameraInfo, "camera/camera_info")
         if self._camera is None:
             self.get_logger().warning(
                 "images without a calibration: no pose can be measured in them; make one with "
                 "us-sim calibrate camera and name it with the parameter camera_info"
             )
         self.health.state = "opening"
-        self._take = self.newest_to(self._publish, "camera")
+        self._take = self.create_newest_handler(self._publish, "camera")
         self._ended = False
         self._closing = threading.Event()
         if self._video.is_file and not self._video.open():
@@ -83,7 +83,7 @@ class CameraDriver(GuardedNode):
                 else:
                     self._follow()
             except Exception as error:  # so that the thread does not end silently
-                self.failed("camera", error)
+                self.report_failure("camera", error)
                 self._video.close()
                 self._closing.wait(RETRY_S)
 
@@ -91,9 +91,9 @@ class CameraDriver(GuardedNode):
         while not self._closing.is_set():
             if self._video.open():
                 while not self._closing.is_set():
-                    age = self._video.grab()
+                    age = self._video.grab_image()
                     now = self.get_clock().now().nanoseconds
-                    if age is None or not self._keep(now - round(1e9 * age)):
+                    if age is None or not self._keep_newest(now - round(1e9 * age)):
                         break
             self._video.close()
             if not self._closing.is_set():
@@ -101,7 +101,7 @@ class CameraDriver(GuardedNode):
                     f"camera {self._video.name} gives no images: see that it is there and that "
                     f"nothing else uses it, or set the parameter source; it is tried again"
                 )
-                self.call_soon(partial(self._miss, problem))
+                self.call_soon(partial(self._on_device_lost, problem))
                 self._closing.wait(RETRY_S)
 
     def _play(self) -> None:
@@ -118,7 +118,7 @@ class CameraDriver(GuardedNode):
             if self._closing.wait(max(due - now, 0) * 1e-9):
                 return
             # It was exposed when it was due, however long it takes to decode.
-            if self._video.grab() is None or not (shown := self._keep(due)):
+            if self._video.grab_image() is None or not (shown := self._keep_newest(due)):
                 # A file that holds nothing at all would be begun again without end.
                 if not (self._loop and number and shown and self._video.open()):
                     break
@@ -128,14 +128,14 @@ class CameraDriver(GuardedNode):
         self._ended = True
         self.call_soon(self._end)
 
-    def _keep(self, taken: int) -> bool:
+    def _keep_newest(self, taken: int) -> bool:
         """Decode the newest image, for the node's thread to publish.
 
         Args:
             taken: ns, when it came from the camera.
         """
         stamp = taken - self._latency
-        pixels = self._video.pixels(grey=self._encoding == "mono8")
+        pixels = self._video.retrieve_image(grey=self._encoding == "mono8")
         if pixels is None:
             return False
         self._take((stamp, pixels))
@@ -143,9 +143,9 @@ class CameraDriver(GuardedNode):
 
     # In the node's thread.
 
-    def _miss(self, problem: str) -> None:
+    def _on_device_lost(self, problem: str) -> None:
         self.health.state, self.health.fault = "no camera", problem
-        self.health.problem("camera", problem)
+        self.health.count_problem("camera", problem)
 
     def _end(self) -> None:
         self.health.state = "finished"
@@ -158,14 +158,14 @@ class CameraDriver(GuardedNode):
         rows, columns = pixels.shape[:2]
         camera = self._camera
         if camera is not None and (columns, rows) != (camera.width, camera.height):
-            self.health.problem(
+            self.health.count_problem(
                 "size",
                 f"the images are {columns} × {rows} pixels, but the camera was calibrated at "
                 f"{camera.width} × {camera.height}: calibrate it at the size it is used at",
             )
         self._descriptions.publish(_info(camera, (columns, rows), stamp, self._frame))
         self._images.publish(image_message(pixels, stamp, self._frame, self._encoding))
-        self.health.published("camera/image_raw", stamp)
+        self.health.count_published("camera/image_raw", stamp)
 
 
 def _info(

@@ -21,9 +21,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
-from us_sim.errors import UsSimError, printable
-from us_sim.nodes import ros_refusal
-from us_sim.nodes.qos import EVERY, LATCHED, SENT, STREAM, overridable
+from us_sim.errors import UsSimError, printable_line
+from us_sim.nodes import explain_ros_error
+from us_sim.nodes.qos import EVERY, LATCHED, SENT, STREAM, qos_override_options
 from us_sim.recording.decoding import nanoseconds_of
 
 T = TypeVar("T")
@@ -54,18 +54,18 @@ class GuardedNode(Node):
         try:
             super().__init__(name, **kwargs)
         except RuntimeError as error:  # an RCLError
-            raise ros_refusal(error) from error
+            raise explain_ros_error(error) from error
         self.health = Health(self)
-        if self.time_is_simulated:
-            self._clockless = self.create_timer(CLOCK_S, self._look_for_a_clock)
+        if self.is_time_simulated:
+            self._clockless = self.create_timer(CLOCK_S, self._check_clock)
 
     @property
-    def time_is_simulated(self) -> bool:
+    def is_time_simulated(self) -> bool:
         """Whether the node's time is that of ``/clock``."""
         clock = self.get_clock()
         return isinstance(clock, ROSClock) and clock.ros_time_is_active
 
-    def _look_for_a_clock(self) -> None:
+    def _check_clock(self) -> None:
         """Say that simulated time does not begin."""
         self._clockless.cancel()
         if not self.get_clock().now().nanoseconds:
@@ -102,48 +102,48 @@ class GuardedNode(Node):
         if self.lockstep and not is_latched:
             qos = EVERY
         where = self.resolve_topic_name(topic)
-        queue = Queue(self) if newest and not self.lockstep else None
+        queue = NewestQueue(self) if newest and not self.lockstep else None
 
         def on_message(message: Any) -> None:
             self.arrived = time.monotonic_ns()
             self.health.received += not is_latched
             try:
-                callback(queue.take_last(subscription, message) if queue else message)
+                callback(queue.drain_to_newest(subscription, message) if queue else message)
             except Exception as error:
-                self.report(where, error)
+                self.handle_error(where, error)
 
         subscription: Subscription = self.create_subscription(
             *(message_type, topic, on_message, qos),
             raw=raw,
-            qos_overriding_options=overridable(),
+            qos_overriding_options=qos_override_options(),
         )
         return subscription
 
-    def report(self, where: str, error: Exception) -> None:
+    def handle_error(self, where: str, error: Exception) -> None:
         """Refuse what came in, or count a failure; raise the error on while the node is ended."""
         if isinstance(error, ExternalShutdownException) or not self.context.ok():
             raise error
         if isinstance(error, UsSimError):
-            self.refused(where, error)
+            self.report_bad_input(where, error)
         else:
-            self.failed(where, error)
+            self.report_failure(where, error)
 
-    def refused(self, where: str, error: UsSimError) -> None:
+    def report_bad_input(self, where: str, error: UsSimError) -> None:
         """Count and say that something which came in cannot be used."""
-        self.health.problem(kind_of(error), f"{where}: {error}; it is not used")
+        self.health.count_problem(error_kind(error), f"{where}: {error}; it is not used")
 
-    def failed(self, where: str, error: Exception) -> None:
+    def report_failure(self, where: str, error: Exception) -> None:
         """Count and say an exception that nobody expected; any thread may."""
         self.failures[where] += 1
-        self.last_failure = shown(f"{where}: {type(error).__name__}: {error}")
-        if self.is_time_to_say(where):
+        self.last_failure = loggable_text(f"{where}: {type(error).__name__}: {error}")
+        if self.is_log_due(where):
             self.get_logger().error(
                 f"{self.last_failure}; the node goes on (failure {self.failures[where]} of this "
                 f"kind; the traceback is at log level debug)"
             )
             self.get_logger().debug("".join(traceback.format_exception(error)))
 
-    def is_time_to_say(self, kind: str) -> bool:
+    def is_log_due(self, kind: str) -> bool:
         """Return whether to log a problem of this kind: one that goes on ever more rarely."""
         now = time.monotonic()
         due, wait = self._due.get(kind, (now, REPEAT_S))
@@ -152,7 +152,7 @@ class GuardedNode(Node):
         self._due[kind] = now + wait, min(2 * wait, SAY_AT_LEAST_S)
         return True
 
-    def guarded(self, where: str, callback: Callable[..., Any]) -> Callable[..., Any]:
+    def guard_callback(self, where: str, callback: Callable[..., Any]) -> Callable[..., Any]:
         """Return the callback, which raises no more, unless the node is being ended.
 
         Args:
@@ -166,33 +166,37 @@ class GuardedNode(Node):
             try:
                 return callback(*arguments)
             except Exception as error:
-                self.report(where, error)
+                self.handle_error(where, error)
                 return None
 
         return call
 
-    def stream(self, message_type: Any, topic: str, qos: QoSProfile = SENT) -> Publisher:
+    def create_stream_publisher(
+        self, message_type: Any, topic: str, qos: QoSProfile = SENT
+    ) -> Publisher:
         """Create a publisher whose quality of service may be overridden by parameters."""
-        return self.create_publisher(message_type, topic, qos, qos_overriding_options=overridable())
+        return self.create_publisher(
+            message_type, topic, qos, qos_overriding_options=qos_override_options()
+        )
 
-    def latched(self, message_type: Any, topic: str) -> Publisher:
+    def create_latched_publisher(self, message_type: Any, topic: str) -> Publisher:
         """Create a publisher of messages that are kept for later subscribers."""
-        return self.stream(message_type, topic, LATCHED)
+        return self.create_stream_publisher(message_type, topic, LATCHED)
 
     def create_timer(self, timer_period_sec: float, callback: Any, *args: Any, **kw: Any) -> Any:
         """As `rclpy.node.Node.create_timer`, guarded, and by real time unless a clock is given.
 
         Reports and whatever else serves the node itself go on while simulated time stands.
         """
-        call = self.guarded(f"timer {_name(callback)}", callback)
+        call = self.guard_callback(f"timer {_name(callback)}", callback)
         return super().create_timer(timer_period_sec, call, *args, **{"clock": self._steady, **kw})
 
     def call_soon(self, callback: Callable[[], Any], where: str = "") -> None:
         """Have the executor call ``callback``, guarded; any thread may ask for that."""
         if self.executor is not None:  # else it has ended, or has not begun
-            self.executor.create_task(self.guarded(where or _name(callback), callback))
+            self.executor.create_task(self.guard_callback(where or _name(callback), callback))
 
-    def newest_to(self, use: Callable[[T], None], where: str) -> Callable[[T], None]:
+    def create_newest_handler(self, use: Callable[[T], None], where: str) -> Callable[[T], None]:
         """Return a function by which a device's thread hands its newest value to the node's.
 
         Args:
@@ -213,7 +217,7 @@ class GuardedNode(Node):
 
         return put
 
-    def offer(self, name: str, act: Callable[[], str]) -> None:
+    def create_command(self, name: str, act: Callable[[], str]) -> None:
         """Offer a momentary command, which has no parameter, as the service ``~/name``.
 
         Args:
@@ -222,7 +226,7 @@ class GuardedNode(Node):
         """
 
         def answer(_: Any, response: Any) -> Any:
-            problem = self.guarded(f"service {name}", act)()
+            problem = self.guard_callback(f"service {name}", act)()
             response.message = FAILED if problem is None else problem
             response.success = problem == ""
             return response
@@ -230,7 +234,7 @@ class GuardedNode(Node):
         self.create_service(Trigger, f"~/{name}", answer)
 
 
-class Queue:
+class NewestQueue:
     """The queue of a subscription whose newest message alone is worked on.
 
     Messages that a full queue has overwritten are counted by the numbers that a publisher gives.
@@ -243,7 +247,7 @@ class Queue:
         self._taken = 0  # messages so far
         self._last: tuple[int, int] | None = None  # a number, and how many were taken by then
 
-    def take_last(self, subscription: Subscription, message: Any) -> Any:
+    def drain_to_newest(self, subscription: Subscription, message: Any) -> Any:
         """Take all that waits behind ``message``, and return the last; count what is skipped."""
         self._taken += 1
         health = self._node.health
@@ -281,7 +285,7 @@ class Subscriptions:
         self._node, self._wanted = node, wanted
         self._there: list[Any] = []
 
-    def keep(self, is_wanted: bool) -> bool:
+    def set_active(self, is_wanted: bool) -> bool:
         """Subscribe, or no longer; whether that is a change."""
         if is_wanted == bool(self._there):
             return False
@@ -293,7 +297,7 @@ class Subscriptions:
         return True
 
 
-def kind_of(error: UsSimError) -> str:
+def error_kind(error: UsSimError) -> str:
     """Return the kind that an error is counted as: ``pose`` of a PoseError."""
     return type(error).__name__.removesuffix("Error").lower()
 
@@ -302,9 +306,9 @@ def _name(callback: Any) -> str:
     return getattr(callback, "__qualname__", type(callback).__name__)
 
 
-def shown(sentence: str) -> str:
+def loggable_text(sentence: str) -> str:
     """Return the sentence as it may be logged: it may quote a message."""
-    return printable(" ".join(sentence[: LONGEST + 1].split()), LONGEST)
+    return printable_line(" ".join(sentence[: LONGEST + 1].split()), LONGEST)
 
 
 ANOTHER_CLOCK_S = 10.0
@@ -346,11 +350,11 @@ class Health:
         self.preparing = ""  # what it goes on without until that is ready
         self.scheduling = ""  # how its process goes before others, if that was asked for
         if hardware_id is not None:
-            self._publisher = node.stream(DiagnosticArray, "diagnostics")
-            node.create_timer(1.0, self.report)
+            self._publisher = node.create_stream_publisher(DiagnosticArray, "diagnostics")
+            node.create_timer(1.0, self.publish_report)
             self._first = node.create_timer(0.01, self._report_first)
 
-    def published(self, topic: str, stamp: TimeMessage | None = None) -> None:
+    def count_published(self, topic: str, stamp: TimeMessage | None = None) -> None:
         """Count a message that went out on ``topic``; with a stamp, its age is a latency."""
         self._published[topic] += 1
         if stamp is not None:
@@ -358,7 +362,7 @@ class Health:
 
     def _age(self, stamp: int) -> float:
         age = 1e-9 * (self._node.get_clock().now().nanoseconds - stamp)
-        is_simulated = self._node.time_is_simulated
+        is_simulated = self._node.is_time_simulated
         if abs(age) < ANOTHER_CLOCK_S and not is_simulated:
             return age
         if not self._clock_differs and not is_simulated:
@@ -369,22 +373,22 @@ class Health:
             )
         return 1e-9 * (time.monotonic_ns() - self._node.arrived)
 
-    def problem(self, kind: str, sentence: str) -> None:
+    def count_problem(self, kind: str, sentence: str) -> None:
         """Count a problem of that kind; one that goes on is logged ever more rarely."""
         self._problems[kind] += 1
-        self._last_problem, self._last_kind = shown(sentence), kind
-        if self._node.is_time_to_say(kind):
+        self._last_problem, self._last_kind = loggable_text(sentence), kind
+        if self._node.is_log_due(kind):
             self._node.get_logger().warning(self._last_problem)
 
-    def problems(self, kind: str) -> int:
+    def problem_count(self, kind: str) -> int:
         """Return how many of that kind there were."""
         return self._problems[kind]
 
     def _report_first(self) -> None:
         self._first.cancel()
-        self.report()
+        self.publish_report()
 
-    def report(self) -> None:
+    def publish_report(self) -> None:
         """Publish the report: once a second, and at once when it is urgent."""
         node, now = self._node, time.monotonic()
         total = max(self._published.values(), default=0)

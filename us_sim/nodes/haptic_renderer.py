@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from std_msgs.msg import Bool, Float64MultiArray
 
 from us_sim.errors import SceneError, StampError, UsSimError
-from us_sim.nodes.messages import contact_model_from, wrench_serialized
+from us_sim.nodes.messages import contact_model_from, serialize_wrench
 from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.recording.decoding import nanoseconds_of, pose_from
-from us_sim.scene.building import haptic_rendering_of, source_settings
+from us_sim.scene.building import build_haptic_rendering, source_settings
 
 _MEASURED = 2000  # ticks of which the jitter is told
 
@@ -86,18 +86,18 @@ class HapticRenderer(SceneNode):
         if self.scene.tissue is None:
             raise SceneError(f"{self.scene.origin}: tissue: is missing, so nothing can be felt")
         settings = source_settings(self.scene, "haptic")
-        self._rendering = haptic_rendering_of(self.scene)
+        self._rendering = build_haptic_rendering(self.scene)
         self._frame = self.scene.tracker.frame
         self._is_taken = False
         self._stops = 0
-        self._wrenches = self.stream(WrenchStamped, "haptic/wrench")
+        self._wrenches = self.create_stream_publisher(WrenchStamped, "haptic/wrench")
         self.subscribe(PoseStamped, "haptic/pose", self._on_pose, FOREIGN)
-        self.subscribe(Bool, "haptic/clutch", lambda m: self._rendering.clutch(m.data), FOREIGN)
+        self.subscribe(Bool, "haptic/clutch", lambda m: self._rendering.set_clutch(m.data), FOREIGN)
         self.subscribe(Float64MultiArray, "tissue/contact_model", self._on_model)
         self.health.measure = self._measure  # once a report: the jitter takes two ticks
-        self._check_doubt()
-        self.create_timer(1.0 / CHECKS, self._check_doubt)
-        self._thread = PeriodicThread(settings.rate, self.guarded("rendering", self._render))
+        self._check_model_age()
+        self.create_timer(1.0 / CHECKS, self._check_model_age)
+        self._thread = PeriodicThread(settings.rate, self.guard_callback("rendering", self._render))
 
     def destroy_node(self) -> None:
         """End with a zero wrench."""
@@ -109,26 +109,26 @@ class HapticRenderer(SceneNode):
         pose, stamp = pose_from(message, self._frame), nanoseconds_of(message.header.stamp)
         if stamp == 0:
             raise StampError("there is no stamp: let the arm's driver set it")
-        self._rendering.pose(stamp, pose, time.monotonic_ns())
+        self._rendering.update_pose(stamp, pose, time.monotonic_ns())
 
     def _on_model(self, message: Float64MultiArray) -> None:
-        self._rendering.model(contact_model_from(message), time.monotonic_ns())
+        self._rendering.update_model(contact_model_from(message), time.monotonic_ns())
 
-    def refused(self, where: str, error: UsSimError) -> None:
+    def report_bad_input(self, where: str, error: UsSimError) -> None:
         """Feel nothing, too, where something that came cannot be used."""
-        super().refused(where, error)
-        self._rendering.distrust(f"{where}: {error}")
+        super().report_bad_input(where, error)
+        self._rendering.stop_rendering(f"{where}: {error}")
 
-    def failed(self, where: str, error: Exception) -> None:
+    def report_failure(self, where: str, error: Exception) -> None:
         """Send a zero wrench, and begin anew, since the failed state may be corrupt."""
-        super().failed(where, error)
-        self._rendering = haptic_rendering_of(self.scene)
+        super().report_failure(where, error)
+        self._rendering = build_haptic_rendering(self.scene)
         self._stops = 0
 
     def _render(self, now: int) -> None:
         rendering = self._rendering
         if not self._is_taken:
-            rendering.distrust("nobody takes the wrench")
+            rendering.stop_rendering("nobody takes the wrench")
         wrench = np.zeros(6)
         try:
             wrench = rendering.render(now)
@@ -139,20 +139,20 @@ class HapticRenderer(SceneNode):
     def _publish(self, wrench: NDArray[np.float64]) -> None:
         newest = self._rendering.stamp
         stamp = self.get_clock().now().nanoseconds if newest is None else newest
-        message = wrench_serialized(wrench, stamp, self._frame)
+        message = serialize_wrench(wrench, stamp, self._frame)
         try:
             self._wrenches.publish(message)
         except Exception:
             if self.context.ok():
                 raise
             return  # rclpy was shut down meanwhile, as by a signal
-        self.health.published("haptic/wrench")
+        self.health.count_published("haptic/wrench")
 
-    def _check_doubt(self) -> None:
+    def _check_model_age(self) -> None:
         self._is_taken = self._wrenches.get_subscription_count() > 0
         doubt, stops = self._rendering.doubt, self._rendering.stops
         if stops > self._stops:
-            self.health.problem("doubt", f"nothing is felt: {self._rendering.stopped}")
+            self.health.count_problem("doubt", f"nothing is felt: {self._rendering.stopped}")
         self._stops = stops
         self.health.state = f"zero: {doubt}" if doubt else "rendering"
 

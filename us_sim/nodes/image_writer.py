@@ -13,7 +13,7 @@ from sensor_msgs.msg import Image
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.parameters import declared
+from us_sim.nodes.parameters import declare_settings
 from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import EVERY
 from us_sim.nodes.settings import ImageWriterSettings
@@ -32,7 +32,7 @@ class ImageWriter(GuardedNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("image_writer", **kwargs)
-        settings = declared(self, ImageWriterSettings())
+        settings = declare_settings(self, ImageWriterSettings())
         wanted = {
             "ultrasound/image": settings.folder,
             "ultrasound/labels": settings.labels,
@@ -43,7 +43,7 @@ class ImageWriter(GuardedNode):
         self._next = 0
         for topic, name in wanted.items():
             if name:
-                callback = partial(self._write, topic, _made(name))
+                callback = partial(self._write, topic, _create_folder(name))
                 self.subscribe(Image, topic, callback, EVERY)
 
     def _write(self, topic: str, folder: Path, message: Image) -> None:
@@ -66,7 +66,7 @@ class ImageWriter(GuardedNode):
         return self._numbers[stamp]
 
 
-def _made(name: str) -> Path:
+def _create_folder(name: str) -> Path:
     folder = Path(name)
     try:
         folder.mkdir(parents=True, exist_ok=True)

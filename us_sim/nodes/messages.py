@@ -22,13 +22,13 @@ from visualization_msgs.msg import Marker
 
 from us_sim.errors import PoseError, StampError, TrackingError
 from us_sim.geometry.pose import Pose
-from us_sim.recording.decoding import LAST_SECOND, SECOND, nanoseconds_since
+from us_sim.recording.decoding import LAST_SECOND, SECOND, to_nanoseconds
 from us_sim.tracking.haptic import ContactModel
 
 CDR_LITTLE_ENDIAN = b"\0\1\0\0"  # what serialized messages begin with
 
 
-def packed(code: str, values: NDArray[Any]) -> array[Any]:
+def pack_array(code: str, values: NDArray[Any]) -> array[Any]:
     """All values in order, copied once (``array(code, bytes)`` takes forty times as long)."""
     data = array(code)
     data.frombytes(np.ascontiguousarray(values).ravel().view(np.uint8).data)
@@ -82,7 +82,7 @@ def wrench_message(
     return message
 
 
-def wrench_serialized(wrench: NDArray[np.float64], stamp: int, frame: str) -> bytes:
+def serialize_wrench(wrench: NDArray[np.float64], stamp: int, frame: str) -> bytes:
     """Force and torque (6,) N, N m about the origin of ``frame`` at ns, as a WrenchStamped.
 
     Written here it takes a tenth of the time, for those who send a thousand a second.
@@ -103,7 +103,7 @@ def contact_model_message(model: ContactModel) -> Float64MultiArray:
     """
     values = (divmod(model.stamp, SECOND), model.pose.position, model.pose.orientation)
     numbers = np.concatenate([*values, model.wrench, model.stiffness.ravel()])
-    return Float64MultiArray(data=packed("d", numbers))
+    return Float64MultiArray(data=pack_array("d", numbers))
 
 
 def contact_model_from(message: Float64MultiArray) -> ContactModel:
@@ -118,7 +118,7 @@ def contact_model_from(message: Float64MultiArray) -> ContactModel:
         raise TrackingError(
             f"a model of the contact is 51 numbers of a sensible size, not {len(values)} or others"
         )
-    stamp = nanoseconds_since(int(values[0]), int(values[1]))
+    stamp = to_nanoseconds(int(values[0]), int(values[1]))
     try:
         pose = Pose(values[2:5], values[5:9])
     except PoseError as error:
@@ -137,7 +137,7 @@ def cloud_message(columns: dict[str, NDArray[np.floating]], stamp: Time, frame: 
     ]
     message.point_step = 4 * table.shape[1]
     message.row_step = message.point_step * len(table)
-    message.data = packed("B", table)
+    message.data = pack_array("B", table)
     message.is_dense = True
     return message
 
@@ -150,7 +150,7 @@ def tetrahedra_message(tetrahedra: NDArray[np.integer]) -> Int32MultiArray:
         MultiArrayDimension(label="tetrahedron", size=count, stride=4 * count),
         MultiArrayDimension(label="node", size=4, stride=4),
     ]
-    message.data = packed("i", tetrahedra.astype(np.int32))
+    message.data = pack_array("i", tetrahedra.astype(np.int32))
     return message
 
 
@@ -181,7 +181,7 @@ def image_message(
     message.height, message.width = pixels.shape[:2]
     message.encoding = encoding
     message.step = pixels.itemsize * channels * message.width
-    message.data = packed("B", pixels)
+    message.data = pack_array("B", pixels)
     return message
 
 
@@ -192,11 +192,11 @@ def affine_message(matrix: NDArray[np.floating]) -> Float64MultiArray:
         MultiArrayDimension(label="row", size=4, stride=16),
         MultiArrayDimension(label="column", size=4, stride=4),
     ]
-    message.data = packed("d", matrix.astype(np.float64))
+    message.data = pack_array("d", matrix.astype(np.float64))
     return message
 
 
-class Shape(NamedTuple):
+class MarkerShape(NamedTuple):
     """Triangles or a line, as a marker shows them."""
 
     namespace: str
@@ -213,12 +213,12 @@ _MARKER_TAIL = struct.pack(
 """Fields of a Marker after its points: colors, textures, text and meshes, all empty."""
 
 
-def serialize_marker(shape: Shape, stamp: Time, frame: str) -> bytes:
+def serialize_marker(shape: MarkerShape, stamp: Time, frame: str) -> bytes:
     """Make the serialized Marker of a shape."""
     return b"".join([CDR_LITTLE_ENDIAN, *_serialized(shape, stamp, frame, 0)])
 
 
-def serialize_markers(shapes: Sequence[Shape], stamp: Time, frame: str) -> bytes:
+def serialize_markers(shapes: Sequence[MarkerShape], stamp: Time, frame: str) -> bytes:
     """Make the serialized MarkerArray of shapes, each in its own namespace."""
     parts = [CDR_LITTLE_ENDIAN, struct.pack("@I", len(shapes))]
     for shape in shapes:
@@ -226,7 +226,7 @@ def serialize_markers(shapes: Sequence[Shape], stamp: Time, frame: str) -> bytes
     return b"".join(parts)
 
 
-def _serialized(shape: Shape, stamp: Time, frame: str, offset: int) -> list[bytes]:
+def _serialized(shape: MarkerShape, stamp: Time, frame: str, offset: int) -> list[bytes]:
     """Make the parts of a serialized marker that begins at that offset of a message.
 
     It holds an object for each point, too slow to make one by one. So the CDR is written here:

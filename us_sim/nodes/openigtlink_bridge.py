@@ -11,13 +11,13 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Float64MultiArray
 
 from us_sim.errors import ProbeError
-from us_sim.nodes.parameters import declared
+from us_sim.nodes.parameters import declare_settings
 from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import OpenIGTLinkBridgeSettings
 from us_sim.recording.decoding import affine_from, nanoseconds_of, pixels_from, pose_from
-from us_sim.tracking.openigtlink import OpenIGTLinkServer, image_message, transform_message
+from us_sim.tracking.openigtlink import OpenIGTLinkServer, pack_image, pack_transform
 
 REMEMBERED = 256  # poses kept for the images that carry their stamps
 CLIENTS_S = 0.5  # between two counts of the connected clients
@@ -34,7 +34,7 @@ class OpenIGTLinkBridge(SceneNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("openigtlink_bridge", **kwargs)
-        settings = declared(self, OpenIGTLinkBridgeSettings())
+        settings = declare_settings(self, OpenIGTLinkBridgeSettings())
         volume = self.scene.volume.pose.pose
         # Volumes are read in LPS; RAS, as 3D Slicer has it, has x and y turned round.
         self._from_patient = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -45,7 +45,9 @@ class OpenIGTLinkBridge(SceneNode):
         self._image: Image | None = None
         self._connected = -1
         self._server = OpenIGTLinkServer(settings.host or "", settings.port)
-        self.subscribe(Float64MultiArray, "ultrasound/image_to_probe", self._on_place, LATCHED)
+        self.subscribe(
+            Float64MultiArray, "ultrasound/image_to_probe", self._on_image_place, LATCHED
+        )
         self.subscribe(PoseStamped, "probe/pose", self._on_pose)
         self.subscribe(Image, "ultrasound/image", self._on_image, newest=True)
         self.create_timer(CLIENTS_S, self._count_clients)
@@ -62,13 +64,13 @@ class OpenIGTLinkBridge(SceneNode):
         super().destroy_node()
 
     def _count_clients(self) -> None:
-        clients = self._server.clients
+        clients = self._server.client_count
         if clients != self._connected:
             self._connected = clients
             self.health.state = f"{clients} connected" if clients else "waiting for a client"
             self.get_logger().info(self.health.state)
 
-    def _on_place(self, message: Float64MultiArray) -> None:
+    def _on_image_place(self, message: Float64MultiArray) -> None:
         matrix = affine_from(message)
         # As thick as a pixel is wide: the simulation's own matrix has a slice a metre thick.
         normal, step = np.linalg.norm(matrix[:3, 2]), np.linalg.norm(matrix[:3, 0])
@@ -91,7 +93,7 @@ class OpenIGTLinkBridge(SceneNode):
     def _on_image(self, message: Image) -> None:
         stamp = nanoseconds_of(message.header.stamp)
         self._image = None
-        if self._image_to_probe is None or not self._server.clients:
+        if self._image_to_probe is None or not self._server.client_count:
             return
         if stamp not in self._poses:
             self._image = message  # its pose may come after it, over another connection
@@ -99,16 +101,18 @@ class OpenIGTLinkBridge(SceneNode):
         pixels = pixels_from(message)
         matrix = self._poses[stamp] @ self._image_to_probe
         name = "Image_Reference"
-        self._server.send(name, image_message(name, stamp, pixels, matrix, "ras"))
-        self.health.published(name, message.header.stamp)
+        self._server.send_message(name, pack_image(name, stamp, pixels, matrix, "ras"))
+        self.health.count_published(name, message.header.stamp)
         self._send_transform("ImageToReference", stamp, matrix, per_pixel=True)
 
     def _send_transform(
         self, name: str, stamp: int, matrix: NDArray[np.float64], *, per_pixel: bool = False
     ) -> None:
-        if self._server.clients:
-            self._server.send(name, transform_message(name, stamp, matrix, per_pixel=per_pixel))
-            self.health.published(name)
+        if self._server.client_count:
+            self._server.send_message(
+                name, pack_transform(name, stamp, matrix, per_pixel=per_pixel)
+            )
+            self.health.count_published(name)
 
 
 main = node_main(OpenIGTLinkBridge, __name__)

@@ -17,14 +17,16 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.settings import is_live, may_be_none, parameter_value, setting_value
-from us_sim.settings.quantity import dial_unit
+from us_sim.nodes.settings import is_live, may_be_none, to_parameter_value, to_setting_value
+from us_sim.settings.quantity import choose_dial_unit
 from us_sim.settings.setting import Settings, kinds_of, rules_of
 
 S = TypeVar("S", bound=Settings)
 
 
-def declared(node: Node, settings: S, names: Collection[str] | None = None, prefix: str = "") -> S:
+def declare_settings(
+    node: Node, settings: S, names: Collection[str] | None = None, prefix: str = ""
+) -> S:
     """Declare parameters for settings; return the settings with the values given at the start.
 
     Args:
@@ -43,7 +45,7 @@ def declared(node: Node, settings: S, names: Collection[str] | None = None, pref
         node.declare_parameter(prefix + name, _raw(settings, name), _descriptor(settings, name))
         for name in chosen
     ]
-    return changed(settings, given, prefix, f"{node.get_name()}.")
+    return settings_with(settings, given, prefix, f"{node.get_name()}.")
 
 
 class LiveSettings:
@@ -73,14 +75,14 @@ class LiveSettings:
     ) -> None:
         self._node, self._check, self._use = node, check, use
         self.values: dict[str, Any] = {
-            key: declared(node, given, (names or {}).get(key), _prefix(key))
+            key: declare_settings(node, given, (names or {}).get(key), _prefix(key))
             for key, given in settings.items()
         }
         self._checked = self.values  # of the change that is about to be made
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._on_post_set)
 
-    def restore(self, values: Mapping[str, Any]) -> None:
+    def restore_settings(self, values: Mapping[str, Any]) -> None:
         """Set parameters back to former settings, by their keys."""
         back = [
             Parameter(_prefix(key) + name, value=_raw(settings, name))
@@ -95,7 +97,7 @@ class LiveSettings:
         """Make the settings as they would be; what refuses that refuses the parameters."""
         try:
             checked = {
-                key: changed(settings, parameters, _prefix(key))
+                key: settings_with(settings, parameters, _prefix(key))
                 for key, settings in self.values.items()
             }
             if checked != self.values and self._check is not None:
@@ -117,7 +119,9 @@ def _prefix(key: str) -> str:
     return key if key.endswith(".") else ""
 
 
-def changed(settings: S, parameters: Sequence[Parameter], prefix: str = "", before: str = "") -> S:
+def settings_with(
+    settings: S, parameters: Sequence[Parameter], prefix: str = "", before: str = ""
+) -> S:
     """Make the settings with the values of parameters that are theirs.
 
     Args:
@@ -131,7 +135,7 @@ def changed(settings: S, parameters: Sequence[Parameter], prefix: str = "", befo
     """
     values = {each.name: each.value for each in parameters}
     changes = {
-        name: setting_value(kind, values[prefix + name])
+        name: to_setting_value(kind, values[prefix + name])
         for name, kind in kinds_of(type(settings)).items()
         if prefix + name in values
     }
@@ -150,7 +154,7 @@ def parameters_with(settings: Settings) -> list[Parameter]:
 
 
 def _raw(settings: Settings, name: str) -> Any:
-    return parameter_value(kinds_of(type(settings))[name], getattr(settings, name))
+    return to_parameter_value(kinds_of(type(settings))[name], getattr(settings, name))
 
 
 def _descriptor(settings: Settings, name: str) -> ParameterDescriptor:
@@ -164,8 +168,8 @@ def _descriptor(settings: Settings, name: str) -> ParameterDescriptor:
     live = is_live(type(settings), name)
     told: dict[str, Any] = {"live": live}
     if rule.quantity and rule.quantity.unit:
-        told |= {"unit": rule.quantity.unit, "shown_in": dial_unit(rule.quantity)}
-    meanings = rule.choice.in_short if rule.choice else {}
+        told |= {"unit": rule.quantity.unit, "shown_in": choose_dial_unit(rule.quantity)}
+    meanings = rule.choice.summaries if rule.choice else {}
     if names := rule.choice.names if rule.choice else rule.choices:
         told["choices"] = {each: meanings.get(each, "") for each in names}
     if may_be_none(kind):

@@ -14,11 +14,11 @@ from us_sim.errors import BagError
 from us_sim.nodes.messages import pose_message, stamp_message
 from us_sim.nodes.process import MEASURING, node_main
 from us_sim.nodes.qos import EVERY, SENT
-from us_sim.nodes.sessions.playback import Player
+from us_sim.nodes.sessions.playback import RecordingPlayer
 from us_sim.nodes.settings import RECORDER, PathPlayerSettings
 from us_sim.recording.decoding import nanoseconds_of
 from us_sim.recording.path import ProbePath, read_path
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import format_count
 
 HELD = 5.0
 """Poses a second of a probe that is held still; images are called stale after half a second."""
@@ -30,7 +30,7 @@ A best-effort subscriber may find a publisher a little later than it is found it
 TELL_AFTER_S = 5.0  # after so long it is said what is waited for
 
 
-class PathPlayer(Player):
+class PathPlayer(RecordingPlayer):
     """A bag's poses on ``tracker/pose``, once the topics that its parameters name are there.
 
     Its parameters are those of `PathPlayerSettings`. What is waited for is said after a while, and
@@ -51,7 +51,9 @@ class PathPlayer(Player):
         self.first, self.length = int(self._path.log_times[0]), int(self._ages[-1])
         self._next = 0  # pose to be sent
         self._sent_at = 0.0  # s, of the monotonic clock
-        self._poses = self.stream(PoseStamped, "tracker/pose", EVERY if lockstep else SENT)
+        self._poses = self.create_stream_publisher(
+            PoseStamped, "tracker/pose", EVERY if lockstep else SENT
+        )
         if lockstep:
             self.subscribe(Image, "ultrasound/image", self._on_image, EVERY)
         self._checks, self._waiting_since = 0, time.monotonic()
@@ -62,7 +64,7 @@ class PathPlayer(Player):
         self._starting = self.create_timer(CHECK_S, self._begin)
         self.pose_count = len(self._path)
         self.get_logger().info(
-            f"{counted(self.pose_count, 'pose')} of {self._path.topic} in {self.path}"
+            f"{format_count(self.pose_count, 'pose')} of {self._path.topic} in {self.path}"
         )
         if self._path.note:
             self.get_logger().warning(self._path.note)
@@ -74,7 +76,7 @@ class PathPlayer(Player):
 
     def _begin(self) -> None:
         """Begin once everything has been there for a while."""
-        missing = self._missing()
+        missing = self._missing_topics()
         self._checks = 0 if missing else self._checks + 1
         told = self.health.values.get("awaited", "")
         if missing not in ("", told) and time.monotonic() - self._waiting_since > TELL_AFTER_S:
@@ -87,21 +89,21 @@ class PathPlayer(Player):
         now, begun = self.now, round(1e9 * self.settings.begun)
         if self.settings.lockstep:
             self.has_begun = True
-            self.head.hold(True, now)
+            self.head.set_held(True, now)
             self.go_to(round(1e9 * self.settings.time))
             return
         self.go_to(round(1e9 * self.settings.time), begun if 0 < begun < now else now)
         turn = int(self._ages[-1] + self._step)
-        if self.settings.loop and 0 < turn < self.head.position(now):  # round and round
-            self.head.go_to(self.head.position(now) % turn, now)
-        due = self._ages <= self.head.position(now) - 0.5 * self._step
+        if self.settings.loop and 0 < turn < self.head.compute_position(now):  # round and round
+            self.head.go_to(self.head.compute_position(now) % turn, now)
+        due = self._ages <= self.head.compute_position(now) - 0.5 * self._step
         self._next = min(int(due.sum()), self.pose_count - 1)
         self.get_logger().info(f"playing from pose {self._next}")
         self._ticking.reset()
-        self.begin()
+        self.begin_playing()
         self.play_on()
 
-    def _missing(self) -> str:
+    def _missing_topics(self) -> str:
         """Return what is awaited and not there; nothing when all is."""
         if not self._poses.get_subscription_count():
             return f"somebody to subscribe to {self._poses.topic_name}"
@@ -118,10 +120,10 @@ class PathPlayer(Player):
         """Return how many poses were sent, also when the first was, and how far that is."""
         return super().describe_progress() | {
             "played": str(self._next),
-            "begun": f"{1e-9 * self.head.begun(self.now):.9f}",
+            "begun": f"{1e-9 * self.head.compute_start(self.now):.9f}",
         }
 
-    def use(self) -> None:
+    def apply_settings(self) -> None:
         """Go on at the rate and with the timer that was set; lockstep has neither."""
         if self.settings.lockstep:
             return
@@ -129,7 +131,7 @@ class PathPlayer(Player):
             self._ticking.timer_period_ns = round(1e9 * self._tick_s)
             self._ticking.reset()
         self.gap = round(self._step / self.settings.rate)
-        super().use()
+        super().apply_settings()
 
     def go_to(self, position: int, at: int | None = None) -> None:
         """Play on there, and send at once the pose that is held there while it is paused."""
@@ -141,15 +143,15 @@ class PathPlayer(Player):
     def send_due(self) -> bool:
         """Send each pose whose time has come, to the nearest half period."""
         if self.settings.paused:
-            self.hold()
+            self.hold_still()
             return False
-        due = self.head.position(self.now) + 0.5 * self._step
+        due = self.head.compute_position(self.now) + 0.5 * self._step
         while not self._is_over and self._ages[self._next] <= due:
             self._send(self._next)
             self._next += 1
         return self._is_over
 
-    def hold(self) -> None:
+    def hold_still(self) -> None:
         """Say a few times a second that a probe which is held still is still there.
 
         Nothing ages while the player holds the clock, too.
@@ -176,11 +178,11 @@ class PathPlayer(Player):
         self._sent_at = time.monotonic()
         if self.settings.lockstep:
             self.head.go_to(int(self._ages[i]), self.now)
-        stamp = self.tell_time()
+        stamp = self.publish_time()
         if self.settings.lockstep:
             stamp = stamp_message(int(self._stamps[i]))
-        self._poses.publish(pose_message(self._path.pose(i), stamp, self._path.frame_id))
-        self.health.published("tracker/pose")
+        self._poses.publish(pose_message(self._path.pose_at(i), stamp, self._path.frame_id))
+        self.health.count_published("tracker/pose")
 
 
 def _rising_stamps(path: ProbePath) -> NDArray[np.int64]:

@@ -10,7 +10,7 @@ from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from us_sim.errors import MessageError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import pose_message
-from us_sim.nodes.parameters import declared
+from us_sim.nodes.parameters import declare_settings
 from us_sim.nodes.process import MEASURING, node_main
 from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.scene_node import LEAD_TOPIC
@@ -23,12 +23,12 @@ class ProbeRobot(GuardedNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("probe_robot", **kwargs)
-        self._settings = declared(self, RobotSettings())
+        self._settings = declare_settings(self, RobotSettings())
         self._robot = Robot(self._settings)
         self.realtime_priority = MEASURING  # it stands for a device
         self.health = Health(self, "robot arm")
         self.health.state = self._robot.action
-        self._poses = self.stream(PoseStamped, LEAD_TOPIC)
+        self._poses = self.create_stream_publisher(PoseStamped, LEAD_TOPIC)
         self.subscribe(TwistStamped, "robot/twist", self._on_twist, FOREIGN)
         self.subscribe(WrenchStamped, "robot/force", self._on_force, FOREIGN)
         self.subscribe(WrenchStamped, "probe/wrench", self._on_wrench)
@@ -38,24 +38,24 @@ class ProbeRobot(GuardedNode):
         twist, frame = twist_from(message), message.header.frame_id
         if frame not in ("probe", "patient"):
             raise MessageError(f"is in frame '{frame}', neither 'probe' nor 'patient'")
-        self._robot.ask_velocity(time.monotonic(), twist, in_patient=frame == "patient")
+        self._robot.request_velocity(time.monotonic(), twist, in_patient=frame == "patient")
 
     def _on_force(self, message: WrenchStamped) -> None:
         wanted, most = float(wrench_from(message, "probe")[2]), self._settings.force
         if not 0.0 <= wanted <= most:
-            self.health.problem(
+            self.health.count_problem(
                 "force", f"robot/force: {wanted:g} N is outside 0 to {most:g} N: the nearer is used"
             )
-        self._robot.ask_force(time.monotonic(), wanted)
+        self._robot.request_force(time.monotonic(), wanted)
 
     def _on_wrench(self, message: WrenchStamped) -> None:
-        self._robot.feel(time.monotonic(), -float(wrench_from(message, "probe")[2]))
+        self._robot.update_force(time.monotonic(), -float(wrench_from(message, "probe")[2]))
 
     def _move(self) -> None:
-        pose = self._robot.move(time.monotonic())
+        pose = self._robot.move_until(time.monotonic())
         self.health.state = self._robot.action
         self._poses.publish(pose_message(pose, self.get_clock().now().to_msg(), "patient"))
-        self.health.published(LEAD_TOPIC)
+        self.health.count_published(LEAD_TOPIC)
 
 
 main = node_main(ProbeRobot, __name__)

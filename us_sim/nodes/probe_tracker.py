@@ -10,9 +10,9 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from visualization_msgs.msg import MarkerArray
 
-from us_sim.geometry.transducer import transducer_mesh
+from us_sim.geometry.transducer import build_transducer_mesh
 from us_sim.nodes.messages import (
-    Shape,
+    MarkerShape,
     pose_message,
     pose_text,
     serialize_markers,
@@ -21,19 +21,19 @@ from us_sim.nodes.messages import (
 )
 from us_sim.nodes.parameters import LiveSettings
 from us_sim.nodes.process import node_main
-from us_sim.nodes.scene_node import poses_ended
+from us_sim.nodes.scene_node import explain_missing_poses
 from us_sim.nodes.settings import ProbeTrackerSettings
 from us_sim.nodes.tf import TFMessage
-from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
+from us_sim.nodes.tracker_inputs.device import TrackerInput, TrackerNode
 from us_sim.scene.building import (
-    collider_of,
-    probe_of,
+    build_collider,
+    build_probe,
+    build_tracking,
+    load_tracker_poses,
     source_settings,
-    tracker_poses_of,
-    tracking_of,
 )
 from us_sim.settings.registry import FILTERS, TRACKERS
-from us_sim.slicing.probe.probe import image_outline
+from us_sim.slicing.probe.probe import compute_image_outline
 from us_sim.tracking.filters import PoseFilter, create_filter
 from us_sim.tracking.measurement import PATIENT, Measurement, TrackingState
 
@@ -49,7 +49,7 @@ LEVELS = {
 }
 
 
-class ProbeTracker(Device):
+class ProbeTracker(TrackerNode):
     """A source's measurements in; ``probe/pose``, ``tf``, ``tf_static`` and ``probe/status`` out.
 
     The source is ``tracker.source`` of the scene, or the parameter ``source``, see
@@ -64,23 +64,25 @@ class ProbeTracker(Device):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("probe_tracker", **kwargs)
         chosen = self.scene.tracker.filter
-        given: dict[str, Any] = {f"{name}.": FILTERS.settings(name)() for name in FILTERS}
+        given: dict[str, Any] = {f"{name}.": FILTERS.load_settings(name)() for name in FILTERS}
         if chosen.given:
             given[f"{chosen.name}."] = chosen.given
         own = ProbeTrackerSettings(filter=chosen.name)
-        live = LiveSettings(self, {OWN: own, **given}, use=self._use)
+        live = LiveSettings(self, {OWN: own, **given}, use=self._apply_settings)
         self._source = live.values[OWN].source or self.scene.tracker.source.name
-        self._tracking = tracking_of(self.scene, _filter(live.values))
+        self._tracking = build_tracking(self.scene, _filter(live.values))
         self._state = TrackingState.WAITING
         self._taken_at = 0  # ns, when the last measurement was taken
         self._last: Measurement | None = None  # that was published
-        self._poses = self.stream(PoseStamped, "probe/pose")
+        self._poses = self.create_stream_publisher(PoseStamped, "probe/pose")
         self._transforms = None
         if TFMessage is not None:
-            self._transforms = self.stream(TFMessage, "tf")
+            self._transforms = self.create_stream_publisher(TFMessage, "tf")
             self._publish_device_frame()
-        self._status = self.latched(DiagnosticStatus, "probe/status")
-        self.latched(MarkerArray, "probe/marker").publish(self._transducer())
+        self._status = self.create_latched_publisher(DiagnosticStatus, "probe/status")
+        self.create_latched_publisher(MarkerArray, "probe/marker").publish(
+            self._transducer_markers()
+        )
         self._input: TrackerInput = TRACKERS.load(self._source)(
             self, source_settings(self.scene, self._source)
         )
@@ -92,20 +94,26 @@ class ProbeTracker(Device):
     def _publish_device_frame(self) -> None:
         device = self.scene.tracker.frame
         if self._source != "tf" and device != PATIENT:
-            place, _ = tracker_poses_of(self.scene)
+            place, _ = load_tracker_poses(self.scene)
             placed = transform_message(place, TimeMessage(), PATIENT, device)
-            self.latched(TFMessage, "tf_static").publish(TFMessage(transforms=[placed]))
+            self.create_latched_publisher(TFMessage, "tf_static").publish(
+                TFMessage(transforms=[placed])
+            )
 
-    def _transducer(self) -> bytes:
+    def _transducer_markers(self) -> bytes:
         """Make markers of the scene's transducer, where it has a collider, and its image."""
         section = self.scene.probe.collider
-        parts = transducer_mesh(collider_of(self.scene)) if section is not None else []
-        shapes = [Shape(p.name, (*p.colour, 1.0), p.vertices[p.triangles.ravel()]) for p in parts]
-        outline = image_outline(probe_of(self.scene))
-        shapes.append(Shape("image", OUTLINE, np.concatenate([outline, outline[:1]]), LINE_WIDTH))
+        parts = build_transducer_mesh(build_collider(self.scene)) if section is not None else []
+        shapes = [
+            MarkerShape(p.name, (*p.colour, 1.0), p.vertices[p.triangles.ravel()]) for p in parts
+        ]
+        outline = compute_image_outline(build_probe(self.scene))
+        shapes.append(
+            MarkerShape("image", OUTLINE, np.concatenate([outline, outline[:1]]), LINE_WIDTH)
+        )
         return serialize_markers(shapes, TimeMessage(), "probe")
 
-    def _use(self, values: dict[str, Any]) -> None:
+    def _apply_settings(self, values: dict[str, Any]) -> None:
         self._tracking.filter = _filter(values)
 
     def destroy_node(self) -> None:
@@ -114,39 +122,41 @@ class ProbeTracker(Device):
             self._input.close()
         super().destroy_node()
 
-    def take(self, measurement: Measurement) -> None:
+    def take_measurement(self, measurement: Measurement) -> None:
         """Publish the probe's pose, if the measurement can be believed."""
         distance = float(abs(measurement.pose.position).max())
         if distance > FARTHEST:
-            self.refuse(
+            self.refuse_measurement(
                 "far",
                 f"the tracker's pose is {distance:.3g} m away, and no tracker sees beyond "
                 f"{FARTHEST:g} m: positions are in metres; it is not used",
             )
             return
-        now = self.now()
+        now = self.read_clock()
         if now < self._taken_at:  # the clock was set back, as when a recording begins again
             self._tracking.reset()
         self._taken_at = now
         restarts = self._tracking.restarts.total()
-        probe = self._tracking.take(measurement, now)
+        probe = self._tracking.process_measurement(measurement, now)
         if self._tracking.restarts.total() > restarts:
             self.get_logger().info(
                 "the tracker's poses start anew, and so does the filter", throttle_duration_sec=5.0
             )
         if probe is None:
             tracking = self._tracking
-            self.health.problem(tracking.last_refused, f"{tracking.last_problem}; it is not used")
+            self.health.count_problem(
+                tracking.last_refused, f"{tracking.last_problem}; it is not used"
+            )
             self._check()
             return
         stamp = stamp_message(probe.stamp)
         self._last = probe
         self._poses.publish(pose_message(probe.pose, stamp, PATIENT))
-        self.health.published("probe/pose", stamp)
+        self.health.count_published("probe/pose", stamp)
         if self._transforms is not None and self._transforms.get_subscription_count():
             transform = transform_message(probe.pose, stamp, PATIENT, "probe")
             self._transforms.publish(TFMessage(transforms=[transform]))
-            self.health.published("tf")
+            self.health.count_published("tf")
         deviation = probe.position_deviation
         self.health.values |= {
             "filter_lag_ms": f"{1e3 * self._tracking.filter.lag:.1f}",
@@ -157,11 +167,11 @@ class ProbeTracker(Device):
 
     def _check(self) -> None:
         """Say so when the state has changed."""
-        state = self._tracking.state(self.now())
+        state = self._tracking.find_state(self.read_clock())
         if state is self._state:
             return
         self.health.warning = self.health.fault = ""
-        if state is TrackingState.LOST and (why := poses_ended(self)):
+        if state is TrackingState.LOST and (why := explain_missing_poses(self)):
             self.health.warning = why
             self.get_logger().info(f"{why}: the probe stays where it is")
         elif state is TrackingState.LOST:

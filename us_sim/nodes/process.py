@@ -21,7 +21,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from us_sim.errors import UsSimError
-from us_sim.nodes import INTERRUPTED, announce_often, ros_refusal
+from us_sim.nodes import INTERRUPTED, announce_often, explain_ros_error
 from us_sim.nodes.guarded_node import GuardedNode
 
 COMPUTING, MEASURING = 1, 2
@@ -29,7 +29,7 @@ COMPUTING, MEASURING = 1, 2
 go before those that compute for tens; drivers of devices may go before both."""
 
 
-def go_first(priority: int = COMPUTING) -> str:
+def raise_priority(priority: int = COMPUTING) -> str:
     """Let all present threads of this process go before ordinary ones, and none that they start.
 
     Args:
@@ -43,7 +43,7 @@ def go_first(priority: int = COMPUTING) -> str:
     return "realtime" if able else "ordinary"
 
 
-def let_receivers_go_first() -> None:
+def raise_receiver_priority() -> None:
     """Let the middleware's threads of this process go before ordinary programs, Python's not.
 
     They acknowledge what comes then, though Python waits for a core: publishers overwrite the few
@@ -97,7 +97,7 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception as error:  # what rcl raises for bad arguments differs between its versions
-        return _refused(ros_refusal(error))
+        return _refused(explain_ros_error(error))
     node: Any = None
     try:
         node = create()
@@ -107,7 +107,7 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
         signals_wait.set()
         executor = create_executor(node)
         if priority := getattr(node, "realtime_priority", 0):
-            node.health.scheduling = go_first(priority)
+            node.health.scheduling = raise_priority(priority)
         spin(node, executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
@@ -178,7 +178,7 @@ def spin(node: Node, executor: Executor) -> None:
             except Exception as error:
                 if not isinstance(node, GuardedNode) or not node.context.ok():
                     raise
-                node.failed("what came in", error)
+                node.report_failure("what came in", error)
     finally:
         executor.remove_node(node)
 

@@ -21,6 +21,6 @@ FOREIGN = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 some may wait while the process does not get a processor."""
 
 
-def overridable() -> QoSOverridingOptions:
+def qos_override_options() -> QoSOverridingOptions:
     """History, depth and reliability of a topic as parameters ``qos_overrides.…``."""
     return QoSOverridingOptions.with_default_policies()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from us_sim.nodes.guarded_node import GuardedNode, Health
-from us_sim.nodes.parameters import declared
+from us_sim.nodes.parameters import declare_settings
 from us_sim.nodes.process import COMPUTING
 from us_sim.nodes.settings import VIEWER, SceneNodeSettings
 from us_sim.scene.reading import load_scene
@@ -19,7 +19,7 @@ class SceneNode(GuardedNode):
 
     def __init__(self, name: str, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
-        settings = declared(self, SceneNodeSettings())
+        settings = declare_settings(self, SceneNodeSettings())
         self.scene: Scene = load_scene(settings.scene, volume=settings.volume)
         self.lockstep = settings.lockstep
         self.threads = settings.threads
@@ -34,7 +34,7 @@ NO_PAGE = "no page moves the probe, and nobody else publishes tracker/pose"
 NO_SENDER = "nobody publishes tracker/pose any more"
 
 
-def poses_ended(node: GuardedNode) -> str:
+def explain_missing_poses(node: GuardedNode) -> str:
     """Return why no fault of a tracker keeps poses away, as at a path's end; empty if one may.
 
     Where pages could move the probe, it is that none is open.

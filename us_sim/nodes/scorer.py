@@ -21,18 +21,18 @@ from sensor_msgs.msg import CompressedImage, Image
 from us_sim import __version__
 from us_sim.errors import ScoreError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.parameters import LiveSettings, declared
+from us_sim.nodes.parameters import LiveSettings, declare_settings
 from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import EVERY
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import ScorerSettings
 from us_sim.recording.decoding import nanoseconds_of, pixels_from, pose_from, wrench_from
-from us_sim.scene.building import scanner_of, volume_of
+from us_sim.scene.building import build_scanner, load_volume
 from us_sim.scoring.exercise import Step, read_exercise
 from us_sim.scoring.live import LiveScan, Score
 from us_sim.scoring.metrics import Scan
 from us_sim.scoring.picture import draw_score
-from us_sim.scoring.result import plain_metrics, state_of
+from us_sim.scoring.result import classify_attempt, select_plain_metrics
 from us_sim.scoring.result_place import ResultPlace
 from us_sim.scoring.settings import CONTACT_FORCE, ScoreSettings
 
@@ -66,12 +66,12 @@ class Scorer(SceneNode):
         self._live_settings, self._settings = live, live.values[OWN]
         name = self._settings.exercise or self.scene.exercise
         self._exercise = read_exercise(name) if name else None
-        limits = declared(self, ScoreSettings())
+        limits = declare_settings(self, ScoreSettings())
         if self._exercise is not None and hasattr(self._exercise.assigned, "force_limit"):
             limits = replace(limits, force_limit=self._exercise.assigned.force_limit)
         self._limits = limits
-        volume = volume_of(self.scene)
-        scanner = scanner_of(self.scene, volume, threads=self.threads)
+        volume = load_volume(self.scene)
+        scanner = build_scanner(self.scene, volume, threads=self.threads)
         self._live = LiveScan(volume, scanner, self._exercise, limits)
         self._title = self._exercise.name if self._exercise is not None else self.scene.name
         results = self._settings.results
@@ -80,16 +80,16 @@ class Scorer(SceneNode):
         if self._settings.begun:
             self._void = "the scorer was started again: begin anew"
         self._begin_attempt()
-        self._score = self.latched(DiagnosticArray, "score")
-        self._picture = self.latched(CompressedImage, "score/picture")
+        self._score = self.create_latched_publisher(DiagnosticArray, "score")
+        self._picture = self.create_latched_publisher(CompressedImage, "score/picture")
         self._picture.publish(CompressedImage())  # what a page has may be of a node before
         self.subscribe(PoseStamped, "probe/pose", self._on_pose, EVERY)
         self.subscribe(WrenchStamped, "probe/wrench", self._on_wrench, EVERY)
         if self._live.lines:
             self.subscribe(Image, "ultrasound/labels", self._on_labels, newest=True)
         self.subscribe(ParameterEvent, "/parameter_events", self._on_parameters, EVERY)
-        self.offer("clear", self._clear)
-        self.offer("draw", self._draw)
+        self.create_command("clear", self._clear)
+        self.create_command("draw", self._draw)
         self.create_timer(1.0, self._tell)
         self.health.state = "following"
 
@@ -97,7 +97,7 @@ class Scorer(SceneNode):
         """Write what could not be written before, and the attempt that has not ended, too."""
         if self._place is not None:
             self._write(self._place.write_kept)
-        self._keep_result(self._live.score(), is_last=True)
+        self._keep_result(self._live.compute_score(), is_last=True)
         super().destroy_node()
 
     def _begin_attempt(self) -> None:
@@ -136,7 +136,7 @@ class Scorer(SceneNode):
     def _check_answers(self, values: Mapping[str, Any]) -> None:
         own: ScorerSettings = values[OWN]
         if any(own.answers) or own.thrombus:
-            self._live.answer(own.answers, own.thrombus)
+            self._live.set_answers(own.answers, own.thrombus)
 
     def _on_parameters(self, message: ParameterEvent) -> None:
         """Note what a person changes of the simulation meanwhile, such as the method."""
@@ -153,12 +153,12 @@ class Scorer(SceneNode):
         is_heard = self._score.get_subscription_count() > 0
         if not is_heard and self._place is None:
             return
-        score = self._live.score()
+        score = self._live.compute_score()
         if score is None:
             return
         if is_heard:
             self._score.publish(self._message(score))
-            self.health.published("score")
+            self.health.count_published("score")
         self._keep_result(score)
 
     def _message(self, score: Score) -> DiagnosticArray:
@@ -194,7 +194,7 @@ class Scorer(SceneNode):
             "changed": "; ".join(self._changes),
             "us_sim": __version__,
         }
-        plain = plain_metrics(score, self._limits.force_limit)
+        plain = select_plain_metrics(score, self._limits.force_limit)
         faults = [{"seconds": round(each.time, 1), "what": each.what} for each in score.faults]
         if self._void:
             faults.insert(0, {"seconds": 0.0, "what": self._void})
@@ -202,11 +202,11 @@ class Scorer(SceneNode):
             "name": self._title,
             "description": exercise.description if exercise is not None else "",
             "scene": self.scene.name,
-            "state": state_of(score, self._void),
+            "state": classify_attempt(score, self._void),
             "seconds": score.seconds,
             "about": about,
             "plain": {each.label: each.brief for each in plain},
-            "steps": [step.document() for step in score.steps],
+            "steps": [step.to_document() for step in score.steps],
             "faults": faults,
             "metrics": {each.label: each.text for each in score.metrics},
         }
@@ -217,7 +217,7 @@ class Scorer(SceneNode):
         if score is None or not is_due or self._is_kept or self._exercise is None:
             return
         self._is_kept = True
-        scan = self._live.scan()
+        scan = self._live.build_scan()
         picture = self._draw_score(scan, score.steps) if scan is not None else b""
         if not is_last:
             self._publish_picture(picture)
@@ -245,19 +245,21 @@ class Scorer(SceneNode):
         message = CompressedImage(format="png", data=array("B", picture))
         message.header.stamp = self.get_clock().now().to_msg()
         self._picture.publish(message)
-        self.health.published("score/picture")
+        self.health.count_published("score/picture")
 
     def _draw(self) -> str:
-        score, scan = self._live.score(), self._live.scan()
+        score, scan = self._live.compute_score(), self._live.build_scan()
         if score is None or scan is None:
             return "nothing was done yet"
         self._publish_picture(self._draw_score(scan, score.steps))
         return ""
 
     def _clear(self) -> str:
-        self._keep_result(self._live.score(), is_last=True)
+        self._keep_result(self._live.compute_score(), is_last=True)
         self._live.clear()
-        self._live_settings.restore({OWN: replace(self._settings, answers=(), thrombus="")})
+        self._live_settings.restore_settings(
+            {OWN: replace(self._settings, answers=(), thrombus="")}
+        )
         self._void = ""
         self._begin_attempt()
         self._picture.publish(CompressedImage())  # what was drawn is of before

@@ -15,7 +15,7 @@ from std_msgs.msg import Header
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.guarded_node import GuardedNode, Health
-from us_sim.nodes.parameters import changed, declared, parameters_with
+from us_sim.nodes.parameters import declare_settings, parameters_with, settings_with
 from us_sim.nodes.settings import SessionControlSettings
 from us_sim.scene.listing import ListedScene
 
@@ -44,19 +44,21 @@ class SessionControl(GuardedNode):
     ) -> None:
         super().__init__("session_control", **kwargs)
         self._check_wanted, self._take_wanted = check, take
-        self.values = declared(self, SessionControlSettings())  # present ones of the parameters
+        self.values = declare_settings(
+            self, SessionControlSettings()
+        )  # present ones of the parameters
         self._is_showing = False
         self._told: tuple[object, ...] = ()
         self._player = cache(partial(AsyncParameterClient, self))
         self._untold: dict[str, dict[str, Any]] = {}  # parameters for a node that plays
         self.health = Health(self, "")
-        self._scenes = self.latched(DiagnosticArray, "session/scenes")
-        self._bags = self.latched(DiagnosticArray, "session/bags")
+        self._scenes = self.create_latched_publisher(DiagnosticArray, "session/scenes")
+        self._bags = self.create_latched_publisher(DiagnosticArray, "session/bags")
         self.add_on_set_parameters_callback(self._check)
         self.add_post_set_parameters_callback(self._take)
-        self.show(settings)
+        self.set_state_parameters(settings)
 
-    def show(self, settings: SessionControlSettings) -> None:
+    def set_state_parameters(self, settings: SessionControlSettings) -> None:
         """Set the parameters to the present state."""
         self._is_showing = True
         try:
@@ -64,7 +66,7 @@ class SessionControl(GuardedNode):
         finally:
             self._is_showing = False
 
-    def tell(self, state: str, values: Mapping[str, str], warning: str = "") -> None:
+    def publish_state(self, state: str, values: Mapping[str, str], warning: str = "") -> None:
         """Report how things are; at once where more than the time in a replay has changed."""
         news = state, warning, {key: values[key] for key in values if key not in _FLOWING}
         is_news, self._told = news != self._told, news
@@ -72,9 +74,9 @@ class SessionControl(GuardedNode):
         self.health.values = dict(values)
         self._hand_on()
         if is_news:
-            self.health.report()
+            self.health.publish_report()
 
-    def tell_player(self, node: str, values: Mapping[str, Any]) -> None:
+    def set_player_parameters(self, node: str, values: Mapping[str, Any]) -> None:
         """Set parameters of the node that plays, as soon as it is there."""
         self._untold = {node: self._untold.get(node, {}) | dict(values)}
         self._hand_on()
@@ -90,7 +92,7 @@ class SessionControl(GuardedNode):
         """Whether somebody hears which scenes there are."""
         return self._scenes.get_subscription_count() > 0
 
-    def tell_scenes(self, scenes: Sequence[ListedScene]) -> None:
+    def publish_scenes(self, scenes: Sequence[ListedScene]) -> None:
         """Publish which scenes and cases can be loaded."""
         message = DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()))
         for scene in scenes:
@@ -111,7 +113,7 @@ class SessionControl(GuardedNode):
             message.status.append(status)
         self._scenes.publish(message)
 
-    def tell_bags(self, bags: Mapping[str, str]) -> None:
+    def publish_bags(self, bags: Mapping[str, str]) -> None:
         """Publish which bags can be played: files by name."""
         message = DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()))
         message.status = [
@@ -122,10 +124,10 @@ class SessionControl(GuardedNode):
 
     def _wanted(self, parameters: list[Parameter]) -> SessionControlSettings:
         """A volume belongs to the scene that it was set with."""
-        wanted = changed(self.values, parameters)
+        wanted = settings_with(self.values, parameters)
         names = {each.name for each in parameters}
         if "scene" in names and "volume" not in names:
-            wanted = changed(wanted, [Parameter("volume", value="")])
+            wanted = settings_with(wanted, [Parameter("volume", value="")])
         return wanted
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
@@ -140,8 +142,8 @@ class SessionControl(GuardedNode):
 
     def _take(self, parameters: list[Parameter]) -> None:
         if self._is_showing:
-            self.values = changed(self.values, parameters)
+            self.values = settings_with(self.values, parameters)
             return
         self.values = self._wanted(parameters)
-        self.show(self.values)
+        self.set_state_parameters(self.values)
         self._take_wanted(self.values, {each.name for each in parameters})

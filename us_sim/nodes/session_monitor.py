@@ -32,9 +32,9 @@ class SessionMonitor(GuardedNode):
         self._published: dict[tuple[str, int], dict[str, int]] = {}
         self.health = Health(self, "")
         self.health.state = "following"
-        self.subscribe(DiagnosticArray, "diagnostics", self._take, EVERY)
+        self.subscribe(DiagnosticArray, "diagnostics", self._on_diagnostics, EVERY)
 
-    def _take(self, message: DiagnosticArray) -> None:
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             name = status.name.rsplit("/", 1)[-1]
             if name not in self._nodes:
@@ -52,21 +52,21 @@ class SessionMonitor(GuardedNode):
                 if key.startswith("published ")
             }
 
-    def follow(self, nodes: Collection[str]) -> None:
+    def follow_nodes(self, nodes: Collection[str]) -> None:
         """Follow these nodes from now on."""
         self._nodes = frozenset(nodes)
         for name in self.reports.keys() - self._nodes:
             del self.reports[name], self.messages[name]
 
-    def tell_lost(self, losses: Sequence[str]) -> None:
+    def report_losses(self, losses: Sequence[str]) -> None:
         """Report all losses so far, each in words, at once and from now on."""
         first = max(len(losses) - TOLD, 0)
         told = {f"lost {i}": text for i, text in enumerate(losses[first:], first + 1)}
         self.health.values = {"lost": str(len(losses)), **told}
         self.health.warning = losses[-1]
-        self.health.report()
+        self.health.publish_report()
 
-    def count(self, node: str, topic: str) -> int:
+    def count_messages(self, node: str, topic: str) -> int:
         """How many messages ``node`` says it has published (or recorded) on ``topic``.
 
         Those that it published before it was started again count, too.

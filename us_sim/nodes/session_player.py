@@ -11,7 +11,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from us_sim.errors import BagError
 from us_sim.nodes.process import node_main
-from us_sim.nodes.sessions.playback import Player
+from us_sim.nodes.sessions.playback import RecordingPlayer
 from us_sim.nodes.sessions.recorded_topic import message_type
 from us_sim.nodes.settings import SessionPlayerSettings
 from us_sim.recording.reader import read_bag
@@ -24,7 +24,7 @@ _SHOWN = 100_000_000
 """ns of a recording that are published at once where it is gone to, so that there is an image."""
 
 
-class SessionPlayer(Player):
+class SessionPlayer(RecordingPlayer):
     """Every topic of a bag, its bytes and stamps untouched, in the recorded order and pace."""
 
     def __init__(self, **kwargs: Any) -> None:
@@ -39,7 +39,7 @@ class SessionPlayer(Player):
         exclude |= {"/clock"} if settings.clock else set()
         offered = [topic for topic in self._bag.topics if topic.name not in exclude]
         left_out = [why for topic in offered if (why := self._offer(topic))]
-        if not any(self._bag.topic(name).message_count for name in self._topics):
+        if not any(self._bag.find_topic(name).message_count for name in self._topics):
             why = "; ".join(left_out) or "no topic of it has a message"
             raise BagError(f"{self.path} holds nothing that can be played: {why}")
         if left_out:
@@ -65,7 +65,7 @@ class SessionPlayer(Player):
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
         try:
             qos = QoSProfile(depth=DEPTH, durability=durability)
-            self._topics[topic.name] = self.stream(kind, topic.name, qos)
+            self._topics[topic.name] = self.create_stream_publisher(kind, topic.name, qos)
         except (NameValidationException, ValueError):
             return f"{topic.name!r} (no topic of ROS 2 is called so)"
         return ""
@@ -78,20 +78,20 @@ class SessionPlayer(Player):
         sought = round(1e9 * self.settings.time)
         self.go_to(sought, None if sought else self.now)
         self.create_timer(0.002, self.play_on)
-        self.begin()
+        self.begin_playing()
 
     def send_due(self) -> bool:
         """Send the messages that are due; while it is paused only what is shown."""
         elapsed = self._shown
         if not self.settings.paused:
-            elapsed = max(elapsed, self.head.position(self.now))
+            elapsed = max(elapsed, self.head.compute_position(self.now))
         while self._waiting is not None and self._waiting.log_time - self.first <= elapsed:
             self._send(self._waiting)
         return self._waiting is None and not self.settings.paused
 
     def _send(self, message: BagMessage) -> None:
         self._topics[message.topic].publish(message.data)
-        self.health.published(message.topic)
+        self.health.count_published(message.topic)
         self._waiting = self._next()
 
     def go_to(self, position: int, at: int | None = None) -> None:
@@ -102,9 +102,9 @@ class SessionPlayer(Player):
         self.damage.clear()
         since = self.first + position if position > 0 else None
         if since is not None:
-            for message in self._bag.latest(self._latched, since, DEPTH):
+            for message in self._bag.read_latest(self._latched, since, DEPTH):
                 self._topics[message.topic].publish(message.data)
-        self._messages = iter(self._bag.messages(list(self._topics), self.damage, since))
+        self._messages = iter(self._bag.read_messages(list(self._topics), self.damage, since))
         self._waiting = self._next()
         self._shown = position + _SHOWN if position and at is None else -1
         self.head.go_to(position, self.now if at is None else at)
@@ -118,7 +118,7 @@ class SessionPlayer(Player):
             self.damage.append(str(error))
             message = None
         for fault in self.damage[known:]:
-            self.health.problem("damage", fault)
+            self.health.count_problem("damage", fault)
         return message
 
 

@@ -19,16 +19,16 @@ from rosbags.interfaces import Qos
 from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import LiveSettings
-from us_sim.nodes.process import let_receivers_go_first, node_main, signals_wait
-from us_sim.nodes.sessions.attachments import session_attachments
+from us_sim.nodes.process import node_main, raise_receiver_priority, signals_wait
+from us_sim.nodes.sessions.attachments import collect_attachments
 from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
 from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.nodes.topics import TOPICS
-from us_sim.recording.schemas import normalized_type, type_hash
+from us_sim.recording.schemas import compute_type_hash, normalize_type
 from us_sim.recording.topic import qos_of
 from us_sim.recording.write_behind import WriteBehind
 from us_sim.recording.writer import BagWriter
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import format_count
 
 _RESERVE = 16 * 1024 * 1024  # bytes of the disk, for the index of some hours
 _WITHOUT_METADATA = (
@@ -53,10 +53,10 @@ class SessionRecorder(GuardedNode):
         settings: SessionRecorderSettings = live.values["recorder"]
         self._settings = settings
         self._is_wanted = functools.cache(
-            lambda topic: settings.records(topic, self.get_namespace())
+            lambda topic: settings.records_topic(topic, self.get_namespace())
         )
         _load_types()
-        self._attachments = session_attachments(settings)
+        self._attachments = collect_attachments(settings)
         self._refused: set[tuple[str, str]] = set()  # topics of a type, as has been said
         self._topics: dict[str, RecordedTopic] = {}
         self._told: Counter[str] = Counter()  # losses of which a person was told
@@ -65,7 +65,7 @@ class SessionRecorder(GuardedNode):
         self.health = Health(self, settings.file)
         self.health.measure = self._measure
         self._begin()
-        self.offer("stop", self.stop)
+        self.create_command("stop", self.stop_recording)
         self.create_timer(0.1, self._discover)
         self.create_timer(1.0, self._follow_publishers)
 
@@ -74,11 +74,11 @@ class SessionRecorder(GuardedNode):
         self._settings = values["recorder"]
         if self._bag is not None and not self._settings.paused:
             for kept in self._latched.values():
-                self._bag.put(*kept)
+                self._bag.put_message(*kept)
             self._latched.clear()
         self._tell_state()
 
-    def stop(self) -> str:
+    def stop_recording(self) -> str:
         """End the recording: its file gets its index, and can be moved away.
 
         Returns:
@@ -88,7 +88,7 @@ class SessionRecorder(GuardedNode):
             return "nothing is recorded any more"
         for topic in self._topics.values():
             with contextlib.suppress(Exception):  # what the rest raises must not cost what is there
-                topic.take_rest()
+                topic.take_remaining()
         bag, self._bag = self._bag, None
         problem = ""
         try:
@@ -97,14 +97,14 @@ class SessionRecorder(GuardedNode):
             problem = str(error)
         with contextlib.suppress(Exception):  # ROS may be shut down already
             if problem:
-                self.health.problem("disk", problem)
+                self.health.count_problem("disk", problem)
             self._tell_losses(bag)
             self._tell_state()
         return ""
 
     def destroy_node(self) -> None:
         """Close the file, so that it has its index and metadata."""
-        self.stop()
+        self.stop_recording()
         super().destroy_node()
 
     def _begin(self) -> None:
@@ -128,7 +128,7 @@ class SessionRecorder(GuardedNode):
         self._file, self._began = Path(bag.path).absolute(), time.monotonic()
         now = self.get_clock().now().nanoseconds
         for name, (media_type, data) in self._attachments.items():
-            self._bag.attach(name, media_type, data, now)
+            self._bag.attach_file(name, media_type, data, now)
         self._tell_state()
         self.get_logger().info(f"recording to {bag.path}")
 
@@ -158,7 +158,7 @@ class SessionRecorder(GuardedNode):
                     self._subscribe(topic, type_name)
                 except Exception as error:  # the names on a network may be anything
                     self._refused.add((topic, type_name))
-                    self.health.problem("topic", f"{topic} is not recorded: {error}")
+                    self.health.count_problem("topic", f"{topic} is not recorded: {error}")
 
     def _subscribe(self, topic: str, type_name: str) -> None:
         if known := self._topics.get(topic):
@@ -184,8 +184,8 @@ class SessionRecorder(GuardedNode):
         if self._bag is None:
             return
         if not self._settings.paused:
-            if self._bag.put(*message):
-                self.health.published(topic)
+            if self._bag.put_message(*message):
+                self.health.count_published(topic)
         elif self._topics[topic].is_latched:
             self._latched[topic] = message
 
@@ -198,11 +198,11 @@ class SessionRecorder(GuardedNode):
 
     def _lost(self, topic: str, count: int) -> None:
         if self._bag is not None and not self._settings.paused:
-            self._bag.lose(topic, count)
+            self._bag.count_lost(topic, count)
 
     def _follow_publishers(self) -> None:
         for topic in self._topics.values():
-            new = topic.follow(self._offered(topic.name, topic.type_name))
+            new = topic.adopt_offers(self._offered(topic.name, topic.type_name))
             if new and self._bag is not None:
                 self._bag.add_topic(topic.name, topic.type_name, new)
         self.health.fault = "" if self._bag is None else self._bag.problem
@@ -214,10 +214,10 @@ class SessionRecorder(GuardedNode):
         new, self._told = lost - self._told, lost
         self.health.dropped = lost.total()
         while bag.untold:
-            self.health.problem("disk", bag.untold.popleft())
+            self.health.count_problem("disk", bag.untold.popleft())
         if new:
-            self.health.problem(
-                "lost", f"{counted(new.total(), 'message')} of {', '.join(new)} not recorded"
+            self.health.count_problem(
+                "lost", f"{format_count(new.total(), 'message')} of {', '.join(new)} not recorded"
             )
 
     def _tell_state(self) -> None:
@@ -238,15 +238,15 @@ def _load_types() -> None:
     """Import the types of the graph's messages: while messages come there is no time for it."""
     for type_name in {topic.type_name for topic in TOPICS}:
         with contextlib.suppress(BagError):  # not every type is everywhere
-            cls = message_type(normalized_type(type_name))
+            cls = message_type(normalize_type(type_name))
             check_for_type_support(cls)
-            type_hash(normalized_type(type_name))
+            compute_type_hash(normalize_type(type_name))
 
 
 def _create() -> SessionRecorder:
     signals_wait.set()  # a file that is begun gets its end
     node = SessionRecorder()
-    let_receivers_go_first()
+    raise_receiver_priority()
     return node
 
 

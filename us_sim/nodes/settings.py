@@ -13,13 +13,20 @@ from typing import Any, get_args, get_origin
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.topics import TOPICS
-from us_sim.scene.building import probe_of
+from us_sim.scene.building import build_probe
 from us_sim.scene.scene import Scene
 from us_sim.scoring.settings import ScoreSettings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import FILTERS, SOLVERS, TRACKERS
-from us_sim.settings.setting import Refusal, Settings, convert, kinds_of, rules_of, setting
-from us_sim.settings.spelling import unknown
+from us_sim.settings.setting import (
+    RefusedValue,
+    Settings,
+    convert_value,
+    kinds_of,
+    rules_of,
+    setting,
+)
+from us_sim.settings.spelling import describe_unknown
 from us_sim.settings.text_files import YamlError, load_yaml
 from us_sim.settings.viewer import ViewerSettings
 from us_sim.skin.settings import MembraneSettings
@@ -68,7 +75,7 @@ NOT_THE_SESSION = ("/rosout", "/parameter_events")
 """Topics that are not recorded."""
 SHARED = ("/tf", "/tf_static")
 """Topics that a recorder takes outside its namespace, too: frames may be common to all."""
-OF_SIMULATORS = tuple(f"/{topic.name}" for topic in TOPICS if not topic.from_drivers)
+OF_SIMULATORS = tuple(f"/{topic.name}" for topic in TOPICS if not topic.is_from_drivers)
 """How the names of topics end that only a simulator publishes, in whichever namespace it is."""
 
 
@@ -187,7 +194,7 @@ class SessionRecorderSettings(Settings):
     )
     attach: tuple[str, ...] = setting(description="more files to attach", default=())
 
-    def records(self, topic: str, namespace: str = "/") -> bool:
+    def records_topic(self, topic: str, namespace: str = "/") -> bool:
         """Whether a recorder in this namespace records a topic, given by its full name.
 
         Topics of another simulator, and those made on demand, it records only by name.
@@ -295,7 +302,7 @@ class TissueDeformerSettings(Settings):
     def check(self) -> None:
         """Two different methods."""
         if self.compare_with == self.solver:
-            raise self.refused(
+            raise self.make_error(
                 "compare_with", f"{self.solver} is in use already: compare with another solver"
             )
 
@@ -467,14 +474,14 @@ def parameters_of(node: str, scene: Scene | None = None) -> Iterator[tuple[str, 
         yield "", settings
     if node == "probe_tracker":
         for name in FILTERS:
-            if rules_of(FILTERS.settings(name)):
-                yield f"{name}.", FILTERS.settings(name)
+            if rules_of(FILTERS.load_settings(name)):
+                yield f"{name}.", FILTERS.load_settings(name)
     if node == "skin_deformer":
         yield "membrane.", MembraneSettings
     if scene is None:
         return
     if node == "slice_interpolator":
-        yield "", type(probe_of(scene))
+        yield "", type(build_probe(scene))
         yield "acoustics.", SoundSettings
         for label in scene.imaging.acoustics.tissues:
             yield f"{TISSUE_PARAMETERS}{label}.", TissueAcoustics
@@ -488,14 +495,12 @@ def parameters_of(node: str, scene: Scene | None = None) -> Iterator[tuple[str, 
             yield f"flow.{name}.", type(flow)
     if node == "tissue_deformer" and scene.tissue is not None:
         for solver in SOLVERS.importable:
-            yield f"{solver}.", SOLVERS.settings(solver)
+            yield f"{solver}.", SOLVERS.load_settings(solver)
         for label, material in scene.tissue.materials.items():
             yield f"materials.{label}.", type(material)
 
 
-def checked_parameters(
-    node: str, scene: Scene | None, given: Mapping[str, str]
-) -> dict[str, object]:
+def check_parameters(node: str, scene: Scene | None, given: Mapping[str, str]) -> dict[str, object]:
     """Values of a node's parameters in SI units, from a person's texts.
 
     Args:
@@ -522,7 +527,9 @@ def _checked(
 ) -> object:
     option = f"--param {node}.{name}"
     if name not in known and not name.startswith(_ROS_OWN):
-        raise UsSimError(f"{option}: {unknown(name, known)} (`us-sim reference {node}` says more)")
+        raise UsSimError(
+            f"{option}: {describe_unknown(name, known)} (`us-sim reference {node}` says more)"
+        )
     try:
         value = load_yaml(text)
     except YamlError as error:
@@ -532,13 +539,13 @@ def _checked(
     settings, field = known[name]
     kind = kinds_of(settings)[field]
     try:
-        made = convert(kind, setting_value(kind, value), rules_of(settings)[field])
-    except Refusal as refusal:
+        made = convert_value(kind, to_setting_value(kind, value), rules_of(settings)[field])
+    except RefusedValue as refusal:
         raise UsSimError(f"{option}: {refusal}") from refusal
-    return parameter_value(kind, made)
+    return to_parameter_value(kind, made)
 
 
-def setting_value(kind: Any, raw: Any) -> Any:
+def to_setting_value(kind: Any, raw: Any) -> Any:
     """Convert a parameter's value to that of a setting of this type."""
     if kind is str and isinstance(raw, int | float):
         return str(raw)  # a camera's number, say
@@ -550,7 +557,7 @@ def setting_value(kind: Any, raw: Any) -> Any:
     return raw
 
 
-def parameter_value(kind: Any, value: Any) -> Any:
+def to_parameter_value(kind: Any, value: Any) -> Any:
     """Convert the value of a setting of this type to that of a parameter.
 
     ROS parameters have no value for nothing: a number that is not given is 0, such a list is one

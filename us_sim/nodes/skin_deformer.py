@@ -9,13 +9,13 @@ from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
 from visualization_msgs.msg import Marker
 
-from us_sim.nodes.messages import Shape, cloud_message, mesh_message, serialize_marker
+from us_sim.nodes.messages import MarkerShape, cloud_message, mesh_message, serialize_marker
 from us_sim.nodes.parameters import LiveSettings
 from us_sim.nodes.process import node_main
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import SkinDeformerSettings
 from us_sim.recording.decoding import nanoseconds_of, pose_from
-from us_sim.scene.building import membrane_of
+from us_sim.scene.building import build_membrane
 from us_sim.settings.setting import rules_of
 from us_sim.skin.settings import MembraneSettings, SkinSettings
 
@@ -38,15 +38,17 @@ class SkinDeformer(SceneNode):
             use=self._use,
             names={"membrane.": rules_of(MembraneSettings)},
         )
-        self._membrane = membrane_of(self.scene, self._settings.values["membrane."])
+        self._membrane = build_membrane(self.scene, self._settings.values["membrane."])
         surface = self._membrane.surface
         self._triangles = surface.triangles
         self._marked = 0
         self.get_logger().info(f"preparing a membrane of {len(surface.vertices)} vertices")
         self._membrane.warm_up()
-        self._nodes = self.stream(PointCloud2, "skin/nodes")
-        self._marker = self.stream(Marker, "skin/marker")
-        self.latched(Mesh, "skin/mesh").publish(mesh_message(surface.vertices, surface.triangles))
+        self._nodes = self.create_stream_publisher(PointCloud2, "skin/nodes")
+        self._marker = self.create_stream_publisher(Marker, "skin/marker")
+        self.create_latched_publisher(Mesh, "skin/mesh").publish(
+            mesh_message(surface.vertices, surface.triangles)
+        )
         self.subscribe(PoseStamped, "probe/pose", self._on_pose, newest=True)
         self.health.state = "ready"
         self.get_logger().info("ready")
@@ -55,9 +57,9 @@ class SkinDeformer(SceneNode):
         if values["membrane."] != self._membrane.settings:
             self._membrane = self._membrane.with_settings(values["membrane."])
 
-    def failed(self, where: str, error: Exception) -> None:
+    def report_failure(self, where: str, error: Exception) -> None:
         """Begin anew, too: the membrane may have been left halfway."""
-        super().failed(where, error)
+        super().report_failure(where, error)
         self._membrane.reset()
 
     def _on_pose(self, message: PoseStamped) -> None:
@@ -73,12 +75,12 @@ class SkinDeformer(SceneNode):
             self._nodes.publish(
                 cloud_message(dict(zip(names, columns, strict=True)), stamp, "patient")
             )
-            self.health.published("skin/nodes", stamp)
+            self.health.count_published("skin/nodes", stamp)
         if shown:
             colour = (*_COLOUR, self._settings.values["markers"].marker_opacity)
-            shape = Shape("skin", colour, skin.vertices[self._triangles.ravel()])
+            shape = MarkerShape("skin", colour, skin.vertices[self._triangles.ravel()])
             self._marker.publish(serialize_marker(shape, stamp, "patient"))
-            self.health.published("skin/marker")
+            self.health.count_published("skin/marker")
         self.health.state = "running"
         self.health.values = {"residual": f"{skin.residual:.3g}", "action": skin.action}
 

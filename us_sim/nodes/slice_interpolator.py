@@ -18,10 +18,10 @@ from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import is_live
-from us_sim.nodes.streams import frame_streams
+from us_sim.nodes.streams import create_frame_streams
 from us_sim.nodes.streams.annotated_image import AnnotatedImage
 from us_sim.recording.decoding import nanoseconds_of, pose_from, tetrahedra_from, vectors_from
-from us_sim.scene.building import probe_of, scanner_of, skin_surface_of, volume_of
+from us_sim.scene.building import build_probe, build_scanner, load_skin_surface, load_volume
 from us_sim.settings.setting import rules_of
 from us_sim.slicing.acoustics.settings import Acoustics, SoundSettings
 from us_sim.slicing.frame import Frame
@@ -55,7 +55,7 @@ class SliceInterpolator(SceneNode):
     With tissue an image is made for every set of nodes, at the pose with the same stamp; without,
     for every pose, through the volume as it is. ``ultrasound/image_to_probe``, latched, says where
     its pixels are. ``ultrasound/image_annotated`` is for the eye, see `AnnotatedImage`, and
-    `frame_streams` are further topics, each made of the same frame for those who subscribe. What a
+    `create_frame_streams` are further topics, each made of the same frame for those who subscribe. What a
     sonographer sets are parameters.
     """
 
@@ -64,11 +64,11 @@ class SliceInterpolator(SceneNode):
         # Before the volume, which may take a minute to make.
         console = self._declare_console()
         probe, imaging, acoustics = _together(console.values)
-        volume = volume_of(self.scene)
-        self._scanner = scanner_of(self.scene, volume, threads=self.threads)
+        volume = load_volume(self.scene)
+        self._scanner = build_scanner(self.scene, volume, threads=self.threads)
         self.get_logger().info(f"preparing {self.scene.slice.name} on {self.scene.volume.name}")
-        self._scanner.prepare(probe, imaging, acoustics)
-        self._scanner.use(probe, imaging, acoustics)
+        self._scanner.prepare_settings(probe, imaging, acoustics)
+        self._scanner.apply_settings(probe, imaging, acoustics)
         self._rest: Any = None
         self._tetrahedra: Any = None
         self._carried = False
@@ -78,8 +78,8 @@ class SliceInterpolator(SceneNode):
         self._number = 0  # of what images are made from
         self._unpaired: PointCloud2 | None = None
         self._skins: dict[int, NDArray[np.float64]] | None = None  # (V, 3) m, by stamps
-        self._streams = frame_streams(self, volume, probe)
-        self._places = self.latched(Float64MultiArray, "ultrasound/image_to_probe")
+        self._streams = create_frame_streams(self, volume, probe)
+        self._places = self.create_latched_publisher(Float64MultiArray, "ultrasound/image_to_probe")
         self._places.publish(affine_message(probe.image_to_probe))
         self._annotated = AnnotatedImage(self, probe, volume.label_names, self._streams)
         if self.scene.tissue is None:
@@ -88,8 +88,8 @@ class SliceInterpolator(SceneNode):
             self.subscribe(PointCloud2, "tissue/rest", self._on_rest, LATCHED)
             self.subscribe(Int32MultiArray, "tissue/tetrahedra", self._on_tetrahedra, LATCHED)
             if self.scene.skin is not None and imaging.contact:
-                surface = skin_surface_of(self.scene)
-                self._scanner.touch(surface.vertices, surface.triangles)
+                surface = load_skin_surface(self.scene)
+                self._scanner.attach_skin(surface.vertices, surface.triangles)
                 self._skins, self._vertices = {}, len(surface.vertices)
                 self.subscribe(PointCloud2, "skin/nodes", self._on_skin)
             self.subscribe(PoseStamped, "probe/pose", self._on_pose)
@@ -99,14 +99,14 @@ class SliceInterpolator(SceneNode):
 
     def _declare_console(self) -> LiveSettings:
         """Declare what a sonographer sets: of probe, image and sound, also by tissue."""
-        probe, imaging = probe_of(self.scene), self.scene.imaging
+        probe, imaging = build_probe(self.scene), self.scene.imaging
         tissues = imaging.acoustics.tissues.items()
         return LiveSettings(
             self,
             {"probe": probe, "imaging": imaging, "acoustics.": imaging.acoustics}
             | {f"{TISSUE_PARAMETERS}{label}.": tissue for label, tissue in tissues},
             check=lambda to: self._prepare(*_together(to)),
-            use=lambda to: self._use(*_together(to)),
+            use=lambda to: self._apply_settings(*_together(to)),
             names={
                 "probe": [name for name in rules_of(type(probe)) if is_live(type(probe), name)],
                 "imaging": rules_of(Imaging),
@@ -115,17 +115,17 @@ class SliceInterpolator(SceneNode):
         )
 
     def _prepare(self, probe: Probe, imaging: Imaging, acoustics: Acoustics) -> None:
-        self._scanner.prepare(probe, imaging, acoustics)
+        self._scanner.prepare_settings(probe, imaging, acoustics)
         for stream in self._streams:
             stream.prepare(probe)
 
-    def _use(self, probe: Probe, imaging: Imaging, acoustics: Acoustics) -> None:
+    def _apply_settings(self, probe: Probe, imaging: Imaging, acoustics: Acoustics) -> None:
         changed = probe != self._scanner.probe
-        self._scanner.use(probe, imaging, acoustics)
+        self._scanner.apply_settings(probe, imaging, acoustics)
         if changed:
             self._is_said = False
             self._places.publish(affine_message(probe.image_to_probe))
-            self._annotated.show_probe(probe)
+            self._annotated.change_probe(probe)
 
     def _on_rest(self, message: PointCloud2) -> None:
         self._rest = message
@@ -139,7 +139,7 @@ class SliceInterpolator(SceneNode):
         if self._rest is None or self._tetrahedra is None:
             return
         nodes = vectors_from(self._rest, "patient")
-        self._scanner.carry(nodes, tetrahedra_from(self._tetrahedra))
+        self._scanner.attach_mesh(nodes, tetrahedra_from(self._tetrahedra))
         self._carried = True
 
     def _on_pose(self, message: PoseStamped) -> None:
@@ -149,7 +149,7 @@ class SliceInterpolator(SceneNode):
     def _on_skin(self, message: PointCloud2) -> None:
         vertices = vectors_from(message, "patient")
         if len(vertices) != self._vertices:
-            self.health.problem(
+            self.health.count_problem(
                 "skin",
                 f"skin/nodes has {len(vertices)} vertices, and the scene's skin {self._vertices}: "
                 f"contact is with the tissue; start both with the same scene",
@@ -161,7 +161,7 @@ class SliceInterpolator(SceneNode):
 
     def _pose(self, message: PoseStamped) -> Pose:
         pose = pose_from(message, "patient")
-        self._annotated.pose_came()
+        self._annotated.on_usable_pose()
         return pose
 
     def _image_unpaired(self) -> None:
@@ -178,12 +178,12 @@ class SliceInterpolator(SceneNode):
             self._unpaired = message
             return
         self._unpaired = None
-        self._image(message, pose, message)
+        self._publish_image(message, pose, message)
 
     def _on_rigid_pose(self, message: PoseStamped) -> None:
-        self._image(message, self._pose(message), None)
+        self._publish_image(message, self._pose(message), None)
 
-    def _image(
+    def _publish_image(
         self, source: PoseStamped | PointCloud2, pose: Pose, tissue: PointCloud2 | None
     ) -> None:
         self._number += 1
@@ -194,11 +194,13 @@ class SliceInterpolator(SceneNode):
         nodes = None if tissue is None else vectors_from(tissue, "patient")
         came = nanoseconds_of(stamp)
         skin = None if self._skins is None else self._skins.get(came)
-        frame = self._scanner.frame(pose, nodes, skin=skin, number=self._number, time=1e-9 * came)
-        self.health.values = self._reach(pose)  # what streams say of this frame comes on top
+        frame = self._scanner.make_frame(
+            pose, nodes, skin=skin, number=self._number, time=1e-9 * came
+        )
+        self.health.values = self._report_reach(pose)  # what streams say of this frame comes on top
         for stream in wanted:
-            stream.show(frame, stamp)
-        self._annotated.show(frame, stamp)
+            stream.publish_frame(frame, stamp)
+        self._annotated.publish_frame(frame, stamp)
         self.health.state = "imaging"
         self.health.values |= {
             "probe_pose": self._annotated.state,
@@ -208,17 +210,17 @@ class SliceInterpolator(SceneNode):
         seen = {key: self.health.values.get(key, "") for key in _SEEN}
         if seen != self._seen:
             self._seen = seen
-            self.health.report()
+            self.health.publish_report()
 
-    def _reach(self, pose: Pose) -> dict[str, str]:
+    def _report_reach(self, pose: Pose) -> dict[str, str]:
         """Report in diagnostics that the image ends beyond the tissue or volume.
 
         It is said once where not only the press makes it do so, so that a smaller depth helps.
         """
-        too_deep = self._scanner.beyond(pose)
+        too_deep = self._scanner.measure_excess_depth(pose)
         if too_deep < _BEYOND:
             return {}
-        if not self._is_said and self._scanner.beyond(pose, pressed=False) >= _BEYOND:
+        if not self._is_said and self._scanner.measure_excess_depth(pose, pressed=False) >= _BEYOND:
             self._is_said = True
             what = "tissue's mesh" if self.scene.tissue is not None else "volume"
             self.get_logger().warning(

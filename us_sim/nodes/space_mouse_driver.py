@@ -12,7 +12,7 @@ from sensor_msgs.msg import Joy
 from us_sim.errors import TrackingError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import stamp_message
-from us_sim.nodes.parameters import declared
+from us_sim.nodes.parameters import declare_settings
 from us_sim.nodes.process import node_main
 from us_sim.nodes.settings import SpaceMouseDriverSettings
 from us_sim.tracking.mouse import SpaceMouse
@@ -29,13 +29,13 @@ class SpaceMouseDriver(GuardedNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("space_mouse_driver", **kwargs)
-        settings = declared(self, SpaceMouseDriverSettings())
+        settings = declare_settings(self, SpaceMouseDriverSettings())
         self._frame = settings.frame_id
         self._patience = 1.0 / settings.rate
         self.health = Health(self, "SpaceMouse")
         self.health.state = "opening"
-        self._joys = self.stream(Joy, "spacenav/joy")
-        self._take = self.newest_to(self._publish, "SpaceMouse")
+        self._joys = self.create_stream_publisher(Joy, "spacenav/joy")
+        self._take = self.create_newest_handler(self._publish, "SpaceMouse")
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="space mouse", daemon=True)
         self._thread.start()
@@ -51,14 +51,14 @@ class SpaceMouseDriver(GuardedNode):
             try:
                 with contextlib.closing(SpaceMouse()) as mouse:
                     while not self._closing.is_set():
-                        mouse.wait(self._patience)
+                        mouse.wait_for_report(self._patience)
                         now = self.get_clock().now().nanoseconds
                         self._take((now, mouse.name, list(mouse.axes), mouse.buttons))
             except TrackingError as error:
-                self.call_soon(partial(self._miss, f"{error}; it is tried again"))
+                self.call_soon(partial(self._on_device_lost, f"{error}; it is tried again"))
                 self._closing.wait(RETRY_S)
             except Exception as error:  # so that the thread does not end silently
-                self.failed("SpaceMouse", error)
+                self.report_failure("SpaceMouse", error)
                 self._closing.wait(RETRY_S)
 
     # In the node's thread.
@@ -70,11 +70,11 @@ class SpaceMouseDriver(GuardedNode):
         message.header.stamp = stamp_message(stamp)
         message.header.frame_id = self._frame
         self._joys.publish(message)
-        self.health.published("spacenav/joy", message.header.stamp)
+        self.health.count_published("spacenav/joy", message.header.stamp)
 
-    def _miss(self, problem: str) -> None:
+    def _on_device_lost(self, problem: str) -> None:
         self.health.state, self.health.fault = "no device", problem
-        self.health.problem("device", problem)
+        self.health.count_problem("device", problem)
 
 
 main = node_main(SpaceMouseDriver, __name__)

@@ -19,7 +19,7 @@ from visualization_msgs.msg import MarkerArray
 from us_sim.errors import SceneError, SolverError, TrackingError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.messages import (
-    Shape,
+    MarkerShape,
     cloud_message,
     contact_model_message,
     serialize_markers,
@@ -32,16 +32,22 @@ from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import StructureMarkersSettings, TissueDeformerSettings
 from us_sim.progress import late_progress
 from us_sim.recording.decoding import nanoseconds_of, pose_from
-from us_sim.scene.building import Structure, materials_of, structures_of, tissue_model_of, volume_of
+from us_sim.scene.building import (
+    Structure,
+    build_materials,
+    build_structures,
+    build_tissue_model,
+    load_volume,
+)
 from us_sim.settings.registry import SOLVERS
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import format_count
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.live_tissue import LiveTissue, TissueMethod
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import Deformation
-from us_sim.tissue.solvers.frame_budget import Pace, shortest
-from us_sim.tracking.haptic import ContactModel, wrench_in_patient
+from us_sim.tissue.solvers.frame_budget import FramePace, time_shortest_run
+from us_sim.tracking.haptic import ContactModel, rotate_to_patient
 
 OWN = "tissue_deformer"
 STRUCTURES = "tissue/structures"
@@ -65,7 +71,7 @@ class StructureMarkers:
         self._node = node
         self._mesh = mesh
         self._settings = LiveSettings(node, {"markers": StructureMarkersSettings()})
-        self._publisher = node.stream(MarkerArray, STRUCTURES)
+        self._publisher = node.create_stream_publisher(MarkerArray, STRUCTURES)
         self._structures: list[Structure] = []
         self._making: threading.Thread | None = None
         self._sent: int | None = None  # ns, the stamp of the last
@@ -88,35 +94,37 @@ class StructureMarkers:
         since = nanoseconds_of(stamp) - self._sent
         return not 0 <= since < 0.99e9 / self._settings.values["markers"].marker_rate
 
-    def publish(self, nodes: NDArray[np.float64], stamp: TimeMessage) -> None:
+    def publish_markers(self, nodes: NDArray[np.float64], stamp: TimeMessage) -> None:
         """Send the structures as they are when the tissue's nodes (N, 3) are there, m."""
         self._sent = nanoseconds_of(stamp)
         shapes = []
         for made in self._structures:
-            corners = made.surface.carry(nodes)[made.surface.triangles.ravel()]
-            shapes.append(Shape(made.name, (*made.colour, 1.0), corners))
+            corners = made.surface.deform_vertices(nodes)[made.surface.triangles.ravel()]
+            shapes.append(MarkerShape(made.name, (*made.colour, 1.0), corners))
         self._publisher.publish(serialize_markers(shapes, stamp, "patient"))
-        self._node.health.published(STRUCTURES)
+        self._node.health.count_published(STRUCTURES)
 
     def _make(self) -> None:
         began = time.monotonic()
         scene = self._node.scene
         triangles = self._settings.values["markers"].structure_triangles
         try:
-            self._structures = list(structures_of(scene, volume_of(scene), self._mesh, triangles))
+            self._structures = list(
+                build_structures(scene, load_volume(scene), self._mesh, triangles)
+            )
             for made in self._structures:
-                made.surface.carry(self._mesh.nodes)  # or a frame would compile it
+                made.surface.deform_vertices(self._mesh.nodes)  # or a frame would compile it
         except UsSimError as error:
             self.state = str(error)
-            self._node.health.problem("structures", f"{error}; no structure is shown")
+            self._node.health.count_problem("structures", f"{error}; no structure is shown")
             return
         except Exception as error:  # so that the thread does not end silently
             self.state = "could not be made"
-            self._node.failed(STRUCTURES, error)
+            self._node.report_failure(STRUCTURES, error)
             return
         count = sum(len(made.surface.triangles) for made in self._structures)
         names = ", ".join(made.name for made in self._structures)
-        self.state = f"{names}: {counted(count, 'triangle')}"
+        self.state = f"{names}: {format_count(count, 'triangle')}"
         self._node.get_logger().info(
             f"made the surfaces of {self.state}, in {time.monotonic() - began:.1f} s"
         )
@@ -156,7 +164,7 @@ class TissueDeformer(SceneNode):
             raise SceneError(f"{scene.origin}: tissue: is missing, so nothing can deform")
         given: dict[str, Any] = {OWN: TissueDeformerSettings(solver=section.solver)}
         for name in SOLVERS.importable:
-            given[f"{name}."] = section.settings.get(name) or SOLVERS.settings(name)()
+            given[f"{name}."] = section.settings.get(name) or SOLVERS.load_settings(name)()
         for label, material in section.materials.items():
             given[f"{_MATERIALS}{label}."] = material
         # Before the volume, which may take a minute to make.
@@ -164,17 +172,23 @@ class TissueDeformer(SceneNode):
         self._used = dict(self._settings.values)  # what the tissue is deformed by
         self._tissue = self._make_tissue(_method_of(self._used))
         mesh = self._tissue.model.mesh
-        self._nodes = self.stream(PointCloud2, "tissue/nodes")
-        self._wrench = self.stream(WrenchStamped, "probe/wrench")
+        self._nodes = self.create_stream_publisher(PointCloud2, "tissue/nodes")
+        self._wrench = self.create_stream_publisher(WrenchStamped, "probe/wrench")
         is_felt = scene.tracker.source.name == "haptic"
-        self._contact = self.stream(Float64MultiArray, "tissue/contact_model") if is_felt else None
-        rest = self.latched(PointCloud2, "tissue/rest")
-        tetrahedra = self.latched(Int32MultiArray, "tissue/tetrahedra")
+        self._contact = (
+            self.create_stream_publisher(Float64MultiArray, "tissue/contact_model")
+            if is_felt
+            else None
+        )
+        rest = self.create_latched_publisher(PointCloud2, "tissue/rest")
+        tetrahedra = self.create_latched_publisher(Int32MultiArray, "tissue/tetrahedra")
         rest.publish(self._cloud(mesh.nodes, ALWAYS))
         if not self.lockstep:
-            self._pace = Pace(shortest(lambda: rest.publish(self._cloud(mesh.nodes, ALWAYS))))
+            self._pace = FramePace(
+                time_shortest_run(lambda: rest.publish(self._cloud(mesh.nodes, ALWAYS)))
+            )
             self.get_logger().info(f"a frame may take {1e3 * self._pace.limit:.1f} ms")
-            self.create_timer(GO_ON_S, self._go_on)
+            self.create_timer(GO_ON_S, self._finish_frame)
             self.create_timer(PREPARED_CHECK_S, self._check_prepared)
         tetrahedra.publish(tetrahedra_message(mesh.tetrahedra))
         self._structures = StructureMarkers(self, mesh) if scene.structures else None
@@ -182,7 +196,7 @@ class TissueDeformer(SceneNode):
         self._sent = mesh.nodes  # (N, 3) m
         self._is_balanced = True  # the last frame
         self._unbalanced = 0  # frames
-        self._came = 0  # poses since `_go_on` was last called
+        self._came = 0  # poses since `_finish_frame` was last called
         self.subscribe(PoseStamped, "probe/pose", self._on_pose, newest=True)
         self._estimated: dict[str, str] = {}  # of a frame since the last report
         self._is_estimate_due = True
@@ -190,25 +204,25 @@ class TissueDeformer(SceneNode):
         self.health.state = f"ready with {self._tissue.solver.name}"
         self.get_logger().info(self.health.state)
 
-    def failed(self, where: str, error: Exception) -> None:
+    def report_failure(self, where: str, error: Exception) -> None:
         """Begin anew after a frame that failed: the tissue may have been left halfway."""
-        super().failed(where, error)
+        super().report_failure(where, error)
         if where != STRUCTURES:  # which another thread makes
             self._tissue.reset()
 
     def _make_tissue(self, method: TissueMethod) -> LiveTissue:
         assert self.scene.tissue is not None
-        volume = volume_of(self.scene)
+        volume = load_volume(self.scene)
         materials = dict(method.materials)
         scene = replace(self.scene, tissue=replace(self.scene.tissue, materials=materials))
-        model = tissue_model_of(scene, volume, self.get_logger().info)
+        model = build_tissue_model(scene, volume, self.get_logger().info)
         self.get_logger().info(
             f"preparing {method.solver} for {len(model.mesh.nodes)} nodes, "
             f"{len(model.mesh.tetrahedra)} tetrahedra"
         )
 
         def constants(materials: Mapping[str, Material]) -> TissueMaterials:
-            return materials_of(scene, materials, model.mesh, volume)
+            return build_materials(scene, materials, model.mesh, volume)
 
         return LiveTissue(model, method, constants, late_progress("preparing the tissue"))
 
@@ -219,33 +233,37 @@ class TissueDeformer(SceneNode):
         changed = [key for key in values if values[key] != self._used[key]]
         named = [f"{own.solver}{compared}" if key == OWN else key[:-1] for key in changed]
         reason = ", ".join(named)
-        self._tissue.prepare(method, reason, wait=self.lockstep)
+        self._tissue.prepare_method(method, reason, wait=self.lockstep)
         now = f"{self._tissue.solver.name} goes on"
         self.get_logger().info(f"{reason}: being prepared; {now}" if reason else f"set back: {now}")
         self._check_prepared()
-        self.health.report()
+        self.health.publish_report()
 
     def _check_prepared(self) -> None:
         """Go on with what is ready; set parameters back where it cannot be made."""
-        tissue, before, preparing = self._tissue, self._tissue.solver.name, self._tissue.preparing
+        tissue, before, preparing = (
+            self._tissue,
+            self._tissue.solver.name,
+            self._tissue.preparation_status,
+        )
         try:
             adopted = tissue.adopt_prepared()
         except SolverError as error:
-            self.health.problem("setting", f"{error}; it is set back")
-            self._settings.restore(self._used)
+            self.health.count_problem("setting", f"{error}; it is set back")
+            self._settings.restore_settings(self._used)
         else:
             if adopted:
                 self._used = dict(self._settings.values)
                 switched = f"switched from {before} to" if tissue.solver.name != before else "with"
                 self.get_logger().info(f"{switched} {tissue.solver.name}, as set from now on")
         if preparing or self.health.preparing:
-            self.health.preparing = tissue.preparing
+            self.health.preparing = tissue.preparation_status
             self.health.state = self._state
 
     @property
     def _state(self) -> str:
         """The method in use, and what is being prepared."""
-        return ", ".join(filter(None, (self._tissue.solver.name, self._tissue.preparing)))
+        return ", ".join(filter(None, (self._tissue.solver.name, self._tissue.preparation_status)))
 
     def _on_pose(self, message: PoseStamped) -> None:
         self._came += 1
@@ -256,9 +274,9 @@ class TissueDeformer(SceneNode):
             self._publish(self._tissue.deform(pose, limit), pose, message.header.stamp)
         self._estimate()  # now that the nodes are sent; it counts as a part of the frame
         if not self.lockstep:
-            self._pace.spend(1e-9 * (time.monotonic_ns() - self.arrived))
+            self._pace.count_frame(1e-9 * (time.monotonic_ns() - self.arrived))
 
-    def _go_on(self) -> None:
+    def _finish_frame(self) -> None:
         """Finish the last frame while no pose comes; publish it again only if that is visible."""
         idle, self._came = self._came == 0, 0
         if not idle:
@@ -290,16 +308,16 @@ class TissueDeformer(SceneNode):
         self._sent = deformation.nodes
         if self._nodes.get_subscription_count():
             self._nodes.publish(self._cloud(deformation.nodes, stamp))
-            self.health.published("tissue/nodes", stamp)
+            self.health.count_published("tissue/nodes", stamp)
         if deformation.is_balanced and self._wrench.get_subscription_count():
             self._wrench.publish(
                 wrench_message(deformation.force, deformation.torque, stamp, "probe")
             )
-            self.health.published("probe/wrench")
+            self.health.count_published("probe/wrench")
         if deformation.is_balanced and self._is_contact_wanted:
             self._publish_contact_model(pose, deformation, stamp)
         if self._structures is not None and self._structures.is_due(stamp):
-            self._structures.publish(deformation.nodes, stamp)
+            self._structures.publish_markers(deformation.nodes, stamp)
 
     @property
     def _is_contact_wanted(self) -> bool:
@@ -310,9 +328,9 @@ class TissueDeformer(SceneNode):
     ) -> None:
         """Publish the model at a pose, just solved for."""
         assert self._contact is not None
-        wrench = wrench_in_patient(pose, deformation.force, deformation.torque)
+        wrench = rotate_to_patient(pose, deformation.force, deformation.torque)
         try:
-            stiffness = self._tissue.solver.contact_stiffness()
+            stiffness = self._tissue.solver.compute_contact_stiffness()
         except np.linalg.LinAlgError:
             stiffness = None
         try:
@@ -320,14 +338,16 @@ class TissueDeformer(SceneNode):
                 stiffness = np.zeros((6, 6))
             model = ContactModel(nanoseconds_of(stamp), pose, wrench, stiffness)
         except TrackingError as error:
-            self.health.problem("contact_model", f"{error}; it is not published")
+            self.health.count_problem("contact_model", f"{error}; it is not published")
             return
         self._contact.publish(contact_model_message(model))
-        self.health.published("tissue/contact_model")
+        self.health.count_published("tissue/contact_model")
 
     def _describe(self, deformation: Deformation) -> None:
         if deformation.inverted:
-            self.health.problem("inside out", _inside_out(deformation, self._tissue.solver.name))
+            self.health.count_problem(
+                "inside out", _inside_out(deformation, self._tissue.solver.name)
+            )
         self.health.warning = ""
         if not deformation.is_balanced:
             self._unbalanced += 1
@@ -362,9 +382,9 @@ class TissueDeformer(SceneNode):
         if self._is_estimate_due:
             self._is_estimate_due = False
             solver = self._tissue.solver
-            found = {"discretisation_error_percent": solver.discretisation_error()}
+            found = {"discretisation_error_percent": solver.estimate_discretisation_error()}
             if has_time:
-                found["force_error_percent"] = solver.force_error()
+                found["force_error_percent"] = solver.estimate_force_error()
             self._estimated = {
                 name: f"{100 * error:.2g}" for name, error in found.items() if error is not None
             }

@@ -27,7 +27,7 @@ class Topic:
     on_demand: bool = False  # not recorded, and so not computed, unless the recorder names it
 
     @property
-    def from_drivers(self) -> bool:
+    def is_from_drivers(self) -> bool:
         """Whether it comes from outside this package, or from a node in place of a driver."""
         stand_ins = {"path_player", "camera_driver", "space_mouse_driver", "probe_robot", "viewer"}
         return set(self.publishers) <= stand_ins

@@ -14,7 +14,7 @@ from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
 
 
-def extract(bag: Path, folder: Path) -> list[Path]:
+def extract_files(bag: Path, folder: Path) -> list[Path]:
     """Write the files that are attached to a bag; return their paths.
 
     Raises:
@@ -49,7 +49,7 @@ def new_file(file: Path) -> BinaryIO:
         raise BagError(f"{file} cannot be written: {error.strerror}") from None
 
 
-def versions() -> str:
+def list_versions() -> str:
     """Return the versions of Python, ROS 2 and the installed packages, one a line."""
     lines = [
         f"python {platform.python_version()}",
@@ -57,14 +57,14 @@ def versions() -> str:
         f"ROS_DISTRO {os.environ.get('ROS_DISTRO') or 'none'}",
         f"RMW_IMPLEMENTATION {os.environ.get('RMW_IMPLEMENTATION') or 'default'}",
         f"byte order {sys.byteorder}",
-        f"us_sim_code {code_checksum()}",
+        f"us_sim_code {compute_code_checksum()}",
     ]
     read = (each.metadata for each in distributions())  # which is parsed at each access
     packages = {str(each["Name"]): str(each["Version"]) for each in read if each["Name"]}
     return "\n".join([*lines, *(f"{n} {v}" for n, v in sorted(packages.items()))]) + "\n"
 
 
-def code_checksum() -> str:
+def compute_code_checksum() -> str:
     """Return the SHA-256 of this package's source files: its version changes less often."""
     root = Path(__file__).parents[1]
     digest = hashlib.sha256()

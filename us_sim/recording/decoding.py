@@ -39,10 +39,10 @@ def nanoseconds_of(stamp: Any) -> int:
         StampError: it is no time: before 1970, with a second's worth of nanoseconds or more, or
             so late that ROS cannot count any further.
     """
-    return nanoseconds_since(stamp.sec, stamp.nanosec)
+    return to_nanoseconds(stamp.sec, stamp.nanosec)
 
 
-def nanoseconds_since(seconds: int, nanoseconds: int) -> int:
+def to_nanoseconds(seconds: int, nanoseconds: int) -> int:
     """Return the ns since 1970 of a stamp's two parts.
 
     Raises:
@@ -56,7 +56,7 @@ def nanoseconds_since(seconds: int, nanoseconds: int) -> int:
     return int(SECOND * seconds + nanoseconds)
 
 
-def stamp_in(data: bytes, begin: int = 4) -> int:
+def read_stamp(data: bytes, begin: int = 4) -> int:
     """Read the ns since 1970 with which a serialized message's header begins.
 
     Nothing else of it is decoded: it may hold megabytes.
@@ -68,10 +68,10 @@ def stamp_in(data: bytes, begin: int = 4) -> int:
     return int(SECOND * seconds + nanoseconds)
 
 
-def first_stamp_in(data: bytes) -> int | None:
+def read_first_stamp(data: bytes) -> int | None:
     """Read the stamp of the first of a serialized sequence of messages; None for an empty one."""
     (count,) = struct.unpack_from(f"{_order_of(data)}I", data, 4)
-    return stamp_in(data, 8) if count else None
+    return read_stamp(data, 8) if count else None
 
 
 def _order_of(data: bytes) -> str:
@@ -379,4 +379,4 @@ def _points_of(marker: Any) -> NDArray[np.float64]:
         pose = Pose(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
     except PoseError as error:
         raise MeshError(f"{marker.ns}: {error}") from error
-    return pose.apply(points)
+    return pose.transform_points(points)

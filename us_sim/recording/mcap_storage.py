@@ -26,7 +26,7 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
 from us_sim.errors import BagError
-from us_sim.recording.schemas import normalized_type
+from us_sim.recording.schemas import normalize_type
 from us_sim.recording.topic import BagMessage, BagTopic, qos_from_yaml
 
 _HEADER = struct.Struct("<BQ")  # opcode, length of what follows
@@ -81,7 +81,7 @@ class McapStorage:
         self.end = max((run.end for run in self._runs), default=None)
         self.topics = [self._topic(id, channel) for id, channel in self._channels.items()]
 
-    def messages(
+    def read_messages(
         self, topics: Collection[str], damage: list[str] | None, since: int | None
     ) -> Iterator[BagMessage]:
         """Yield the messages of these topics, since a log time (ns), in the order of log times.
@@ -278,4 +278,4 @@ def _messages(
 
 
 def _type_name(schema: Schema | None) -> str:
-    return normalized_type(schema.name) if schema else ""
+    return normalize_type(schema.name) if schema else ""

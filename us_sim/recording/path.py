@@ -32,15 +32,15 @@ from us_sim.errors import BagError, TrackingError, VolumeError
 from us_sim.geometry.frame_chain import FrameChain
 from us_sim.geometry.pose import Pose
 from us_sim.recording.reader import Bag, read_bag
-from us_sim.recording.schemas import jazzy_definitions, stamped
+from us_sim.recording.schemas import load_jazzy_definitions, serialize_stamped
 from us_sim.recording.topic import DEFAULT_QOS, BagTopic
 from us_sim.recording.writer import BagWriter
 from us_sim.volume.sequences.sequence import SEQUENCE_SUFFIXES, read_sequence
 from us_sim.volume.sequences.transforms import (
     FrameTransforms,
-    along,
+    find_shortest_chain,
     is_image_frame,
-    shortest_chain,
+    multiply_chain,
     split_transform_name,
 )
 
@@ -72,14 +72,14 @@ class ProbePath:
     def __len__(self) -> int:
         return len(self.stamps)
 
-    def pose(self, index: int) -> Pose:
+    def pose_at(self, index: int) -> Pose:
         """Return the pose at a place in the path, its quaternion normalised."""
         return Pose(self.positions[index], self.orientations[index])
 
     @property
     def poses(self) -> list[Pose]:
-        """Return all poses, as `pose` returns them."""
-        return [self.pose(index) for index in range(len(self))]
+        """Return all poses, as `pose_at` returns them."""
+        return [self.pose_at(index) for index in range(len(self))]
 
     @property
     def duration(self) -> float:
@@ -87,7 +87,7 @@ class ProbePath:
         return float(self.log_times[-1] - self.log_times[0]) / 1e9 if len(self) else 0.0
 
 
-class Row(NamedTuple):
+class RecordedPose(NamedTuple):
     """One recorded pose, as it was recorded."""
 
     log_time: int  # ns since the epoch
@@ -119,7 +119,7 @@ _POSES: Mapping[str, Callable[[Any], list[_Found]]] = {
 }
 
 
-def bodies_in(bag: Bag) -> dict[str, list[str]]:
+def list_bodies(bag: Bag) -> dict[str, list[str]]:
     """Return the names of the bodies whose poses a bag holds, by the types of their messages.
 
     Raises:
@@ -136,7 +136,7 @@ def bodies_in(bag: Bag) -> dict[str, list[str]]:
     return found
 
 
-def pose_rows(bag: Bag, name: str) -> Iterator[Row]:
+def read_pose_rows(bag: Bag, name: str) -> Iterator[RecordedPose]:
     """Yield the poses of a body, in the order in which they were recorded.
 
     The leading slash of its name may be left away.
@@ -145,7 +145,7 @@ def pose_rows(bag: Bag, name: str) -> Iterator[Row]:
         BagError: the bag has no such topic or body, or one of a type without poses.
     """
     topic_name, _, body = name.partition(":")
-    topic = bag.topic(topic_name)
+    topic = bag.find_topic(topic_name)
     if topic.type_name not in _POSES:
         raise BagError(
             f"{bag.path} holds {topic.name} as {topic.type_name}: a path needs one of "
@@ -165,36 +165,38 @@ def pose_rows(bag: Bag, name: str) -> Iterator[Row]:
         raise BagError(f"{bag.path} has no {name}; it has {names}")
 
 
-def _each(bag: Bag, topic: BagTopic) -> Iterator[tuple[str, Row]]:
+def _each(bag: Bag, topic: BagTopic) -> Iterator[tuple[str, RecordedPose]]:
     """Yield every pose of a topic's messages, after the body that it is of."""
     poses = _POSES[topic.type_name]
-    for raw in bag.messages([topic.name]):
+    for raw in bag.read_messages([topic.name]):
         message = bag.deserialize(raw)
         try:
             for body, header, p, q in poses(message):
                 stamp = header.stamp.sec * 10**9 + header.stamp.nanosec
                 pose = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
-                yield body, Row(raw.log_time, stamp, header.frame_id, pose)
+                yield body, RecordedPose(raw.log_time, stamp, header.frame_id, pose)
         except (AttributeError, TypeError) as error:  # the bag's own definitions are damaged
             raise BagError(f"{bag.path}: no {topic.type_name} of ROS 2: {error}") from None
 
 
-def _chained(bag: Bag, topic: BagTopic, body: str, parent: str) -> Iterator[Row]:
+def _chained(bag: Bag, topic: BagTopic, body: str, parent: str) -> Iterator[RecordedPose]:
     """Yield the poses of a frame of tf in one further up, as `FrameChain` makes them live."""
     chain, is_empty = FrameChain(body, parent), True
     static = f"{topic.name}_static"
     for name in [each.name for each in bag.topics if each.name == static] + [topic.name]:
-        for frame, row in _each(bag, bag.topic(name)):
+        for frame, row in _each(bag, bag.find_topic(name)):
             numbers = np.array(row.pose)
-            if not is_pose(numbers[None])[0]:
+            if not are_poses(numbers[None])[0]:
                 continue
             above, pose = row.frame_id.lstrip("/"), Pose(numbers[:3], numbers[3:])
             if name == static:
-                chain.fix(frame, above, pose)
-            elif made := chain.move(frame, above, row.stamp, pose):
+                chain.set_fixed_link(frame, above, pose)
+            elif made := chain.update_link(frame, above, row.stamp, pose):
                 stamp, found = made
                 is_empty = False
-                yield Row(row.log_time, stamp, parent, (*found.position, *found.orientation))
+                yield RecordedPose(
+                    row.log_time, stamp, parent, (*found.position, *found.orientation)
+                )
     if is_empty:
         raise BagError(
             f"{bag.path} holds no way in {topic.name} from '{body}' up to '{parent}' that moves"
@@ -223,15 +225,15 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
         TrackingError: the same of a recording.
     """
     if is_tracker_recording(path):
-        return read_tracker_recording(path).probe_path(topic, option=option)
+        return read_tracker_recording(path).make_probe_path(topic, option=option)
     bag = read_bag(path)
-    name = whole_name(bag, topic or _only_body(bag, option))
-    rows = list(pose_rows(bag, name))
+    name = find_whole_name(bag, topic or _only_body(bag, option))
+    rows = list(read_pose_rows(bag, name))
     if topic is None and len(_frames(rows)) > 1:  # a hand and a device took turns
         poses = [each.name for each in bag.topics if each.type_name == POSE_STAMPED]
         of_probe = [each for each in poses if each.endswith("/probe/pose") and each != name]
         if len(of_probe) == 1:
-            name, rows = of_probe[0], list(pose_rows(bag, of_probe[0]))
+            name, rows = of_probe[0], list(read_pose_rows(bag, of_probe[0]))
     return _usable(bag, name, rows)
 
 
@@ -257,22 +259,22 @@ def write_poses(writer: BagWriter, path: ProbePath) -> None:
         BagError: it cannot be written.
     """
     writer.add_topic(path.topic, POSE_STAMPED, [DEFAULT_QOS])
-    types = jazzy_definitions().types
+    types = load_jazzy_definitions().types
     rows = zip(path.stamps, path.log_times, path.positions, path.orientations, strict=True)
     for stamp, log_time, position, orientation in rows:
         pose = types["geometry_msgs/msg/Pose"](
             position=types["geometry_msgs/msg/Point"](*position.tolist()),
             orientation=types["geometry_msgs/msg/Quaternion"](*orientation.tolist()),
         )
-        message = stamped(POSE_STAMPED, int(stamp), path.frame_id, pose=pose)
-        writer.write(path.topic, message, int(log_time), int(stamp))
+        message = serialize_stamped(POSE_STAMPED, int(stamp), path.frame_id, pose=pose)
+        writer.write_message(path.topic, message, int(log_time), int(stamp))
 
 
 def _only_body(bag: Bag, option: str) -> str:
     """Return the only topic of PoseStamped, a session's tracker poses, or the only other body."""
     stamped = [topic.name for topic in bag.topics if topic.type_name == POSE_STAMPED]
     tracked = [name for name in stamped if name.endswith("/tracker/pose")]
-    others = [] if stamped else [name for names in bodies_in(bag).values() for name in names]
+    others = [] if stamped else [name for names in list_bodies(bag).values() for name in names]
     for candidates in (stamped, tracked, others):
         if len(candidates) == 1:
             return candidates[0]
@@ -290,7 +292,7 @@ def _only_body(bag: Bag, option: str) -> str:
     )
 
 
-def is_pose(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
+def are_poses(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return (K,) whether each of (K, 7) is finite and has an orientation, as `Pose` asks for.
 
     Trackers send a zero quaternion for a lost marker.
@@ -300,17 +302,17 @@ def is_pose(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.isfinite(poses).all(axis=1) & has_orientation
 
 
-def whole_name(bag: Bag, name: str) -> str:
+def find_whole_name(bag: Bag, name: str) -> str:
     """Return a topic's or body's name with its leading slash, where the bag has one."""
     topic, colon, body = name.partition(":")
-    return bag.topic(topic).name + colon + body
+    return bag.find_topic(topic).name + colon + body
 
 
-def _frames(rows: list[Row]) -> list[str]:
+def _frames(rows: list[RecordedPose]) -> list[str]:
     return list(dict.fromkeys(row.frame_id for row in rows))
 
 
-def _usable(bag: Bag, name: str, rows: list[Row]) -> ProbePath:
+def _usable(bag: Bag, name: str, rows: list[RecordedPose]) -> ProbePath:
     """Return the poses of one frame that can be used."""
     if not rows:
         raise BagError(f"{bag.path} holds no pose on {name}; {bag.fault or 'it is silent'}")
@@ -321,7 +323,7 @@ def _usable(bag: Bag, name: str, rows: list[Row]) -> ProbePath:
             f"frame"
         )
     poses = np.array([row.pose for row in rows], np.float64)
-    usable = is_pose(poses)
+    usable = are_poses(poses)
     rejected = len(rows) - int(usable.sum())
     notes = [bag.fault] if bag.fault else []
     if rejected:
@@ -356,11 +358,11 @@ class TrackerRecording:
     def __len__(self) -> int:
         return len(self.times)
 
-    def left_out(self, name: str) -> dict[str, int]:
+    def count_left_out(self, name: str) -> dict[str, int]:
         """Count the samples of a transform that are not valid, by reason."""
         return dict(Counter(fault for fault in self.transforms[name].faults if fault))
 
-    def probe_path(self, name: str | None = None, option: str = "topic") -> ProbePath:
+    def make_probe_path(self, name: str | None = None, option: str = "topic") -> ProbePath:
         """Return the valid poses of a body as a path, by the recorder's clock.
 
         Args:
@@ -383,15 +385,15 @@ class TrackerRecording:
         body, end = split_transform_name(name) or (name, None)
         frames = filter(None, map(split_transform_name, self.transforms))
         ends = [end] if end else [top for start, top in frames if start == body]
-        chain = shortest_chain(self.transforms, body, ends[0]) if len(ends) == 1 else None
+        chain = find_shortest_chain(self.transforms, body, ends[0]) if len(ends) == 1 else None
         if chain is None:
             raise TrackingError(
                 f"{self.path}: no transform or several lead from {name} to {end or 'a frame'}; its "
                 f"transforms are {names}"
             )
-        found = along(self.transforms, chain)
+        found = multiply_chain(self.transforms, chain)
         valid = found.valid
-        why = self.why(key for key, _ in chain.steps)
+        why = self.explain_gaps(key for key, _ in chain.steps)
         if not valid.any():
             raise TrackingError(
                 f"{self.path}: none of the {len(self)} poses of {name} is valid{why}"
@@ -409,12 +411,12 @@ class TrackerRecording:
             note=f"{rejected} of the {count} poses of {name} are left out{why}" if rejected else "",
         )
 
-    def why(self, names: Iterable[str]) -> str:
+    def explain_gaps(self, names: Iterable[str]) -> str:
         """Say in brackets which samples of these transforms were left out; nothing if none were."""
         said = [
             f"{count} with {reason}"
             for name in names
-            for reason, count in self.left_out(name).items()
+            for reason, count in self.count_left_out(name).items()
         ]
         if self.untimed:
             said.append(f"{self.untimed} without a time")
@@ -453,7 +455,7 @@ def read_tracker_recording(path: str | Path) -> TrackerRecording:
     if not any(series.valid.any() for series in transforms.values()):
         raise TrackingError(
             f"{path}: none of its {len(times)} samples holds a time and a valid transform"
-            f"{recording.why(transforms)}"
+            f"{recording.explain_gaps(transforms)}"
         )
     return recording
 

@@ -3,14 +3,14 @@
 >>> from us_sim.recording.playhead import Playhead
 >>> head = Playhead(rate=2.0)
 >>> head.go_to(100, now=1000)
->>> head.position(now=1050)
+>>> head.compute_position(now=1050)
 200
->>> head.run_at(1.0, now=1050)
->>> head.hold(True, now=1060)
->>> head.position(now=9999)
+>>> head.set_rate(1.0, now=1050)
+>>> head.set_held(True, now=1060)
+>>> head.compute_position(now=9999)
 210
->>> head.hold(False, now=9999)
->>> head.position(now=10009)
+>>> head.set_held(False, now=9999)
+>>> head.compute_position(now=10009)
 220
 """
 
@@ -26,25 +26,25 @@ class Playhead:
         self._at = 0  # in the recording,
         self._since = 0  # at this time of the clock
 
-    def position(self, now: int) -> int:
+    def compute_position(self, now: int) -> int:
         """Return how far after the recording's start it is."""
         return self._at if self.is_paused else self._at + round((now - self._since) * self.rate)
 
-    def begun(self, now: int) -> int:
+    def compute_start(self, now: int) -> int:
         """Return when it would have been at the start, had it always gone at this rate."""
-        return now - round(self.position(now) / self.rate)
+        return now - round(self.compute_position(now) / self.rate)
 
     def go_to(self, position: int, now: int) -> None:
         """Be there at that time."""
         self._at, self._since = position, now
 
-    def run_at(self, rate: float, now: int) -> None:
+    def set_rate(self, rate: float, now: int) -> None:
         """Change the pace."""
-        self.go_to(self.position(now), now)
+        self.go_to(self.compute_position(now), now)
         self.rate = rate
 
-    def hold(self, is_held: bool, now: int) -> None:
+    def set_held(self, is_held: bool, now: int) -> None:
         """Stay there, or go on from there; nothing happens where that is so already."""
         if is_held != self.is_paused:
-            self.go_to(self.position(now), now)
+            self.go_to(self.compute_position(now), now)
             self.is_paused = is_held

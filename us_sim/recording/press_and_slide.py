@@ -17,7 +17,7 @@ EPOCH = 1_700_000_000 * 10**9  # ns
 _HOVER = 0.010  # m, height above the skin before and after
 
 
-def press_and_slide(
+def make_press_and_slide(
     rate: float = 60.0,
     duration: float = 10.0,
     depth: float = 0.012,
@@ -66,8 +66,8 @@ def _minimum_jerk(keys: list[list[float]], times: NDArray[np.float64]) -> NDArra
     return values[left] + blend * (values[left + 1] - values[left])
 
 
-def pressing_path(depth: float, slide: float = 0.008) -> Path:
-    """Return the file of `press_and_slide` with that depth and slide, m, to a tenth of a mm.
+def find_pressing_path(depth: float, slide: float = 0.008) -> Path:
+    """Return the file of `make_press_and_slide` with that depth and slide, m, to a tenth of a mm.
 
     Raises:
         BagError: the cache folder cannot be written.
@@ -81,7 +81,7 @@ def pressing_path(depth: float, slide: float = 0.008) -> Path:
         file.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{file.name}.", dir=file.parent) as folder:
             partial = Path(folder, file.name)
-            path = press_and_slide(depth=round(depth, 4), slide=round(slide, 4))
+            path = make_press_and_slide(depth=round(depth, 4), slide=round(slide, 4))
             write_path(partial, path, sidecar=False)
             os.replace(partial, file)
     except OSError as error:

@@ -8,7 +8,7 @@
 ...     writer.add_topic("/note", "std_msgs/msg/String")
 ...     writer.write("/note", bytes.fromhex("00010000 03000000 686900"), 1_700_000_000_000_000_000)
 >>> bag = read_bag(file)
->>> [bag.deserialize(message).data for message in bag.messages()]
+>>> [bag.deserialize(message).data for message in bag.read_messages()]
 ['hi']
 """
 
@@ -27,13 +27,13 @@ import zstandard
 from rosbags.interfaces import Qos
 from rosbags.typesys.store import Typestore
 
-from us_sim.errors import BagError, printable
+from us_sim.errors import BagError, printable_line
 from us_sim.recording import MARKER
 from us_sim.recording.metadata import METADATA, missing_files
-from us_sim.recording.schemas import definitions, jazzy_definitions
-from us_sim.recording.storage import Storage, bag_files, open_storage
+from us_sim.recording.schemas import load_jazzy_definitions, parse_definitions
+from us_sim.recording.storage import Storage, find_bag_files, open_storage
 from us_sim.recording.topic import LOST, BagMessage, BagTopic
-from us_sim.settings.spelling import aligned
+from us_sim.settings.spelling import align_columns
 
 
 class Bag:
@@ -54,7 +54,7 @@ class Bag:
         topics: dict[str, BagTopic] = {}
         for topic in (topic for storage in storages for topic in storage.topics):
             earlier = topics.get(topic.name)
-            topics[topic.name] = earlier.joined(topic, str(path)) if earlier else topic
+            topics[topic.name] = earlier.merge_topic(topic, str(path)) if earlier else topic
         self.topics = tuple(topics.values())
         self._topics = topics
         starts, ends = [each.start for each in storages], [each.end for each in storages]
@@ -68,7 +68,7 @@ class Bag:
             faults.append(f"{path / METADATA} names files that are not there: {', '.join(missing)}")
         self.fault = "; ".join(faults)
 
-    def topic(self, name: str) -> BagTopic:
+    def find_topic(self, name: str) -> BagTopic:
         """Return the topic of this name, with or without its leading slash.
 
         Raises:
@@ -81,12 +81,14 @@ class Bag:
             f"{self.path} has no topic {name}; it has {', '.join(sorted(self._topics)) or 'none'}"
         )
 
-    def markers(self) -> list[tuple[int, str]]:
+    def read_markers(self) -> list[tuple[int, str]]:
         """Return the moments that a person marked: ns since the epoch, and the text."""
         topics = [each.name for each in self.topics if each.name.endswith(f"/{MARKER}")]
-        return [(each.log_time, self.deserialize(each).data) for each in self.messages(topics, [])]
+        return [
+            (each.log_time, self.deserialize(each).data) for each in self.read_messages(topics, [])
+        ]
 
-    def lost(self) -> Counter[str]:
+    def count_losses(self) -> Counter[str]:
         """Count the messages that the recorder says that it lost, by topic."""
         lost: Counter[str] = Counter()
         for note in self.notes:
@@ -94,15 +96,15 @@ class Bag:
                 lost.update({topic: _count(text) for topic, text in note.metadata.items()})
         return lost
 
-    def all_messages(self, faults: list[str]) -> Iterator[BagMessage]:
+    def read_all_messages(self, faults: list[str]) -> Iterator[BagMessage]:
         """Yield every message that can be read; ``faults`` takes everything that is wrong."""
         faults += [self.fault] if self.fault else []
         try:
-            yield from self.messages(damage=faults)
+            yield from self.read_messages(damage=faults)
         except BagError as error:
             faults.append(str(error))
 
-    def messages(
+    def read_messages(
         self,
         topics: Collection[str] | None = None,
         damage: list[str] | None = None,
@@ -119,11 +121,13 @@ class Bag:
         Raises:
             BagError: the bag has no such topic, or is damaged and ``damage`` is None.
         """
-        names = {self.topic(name).name for name in topics} if topics is not None else self._topics
-        streams = [storage.messages(names, damage, since) for storage in self._storages]
+        names = (
+            {self.find_topic(name).name for name in topics} if topics is not None else self._topics
+        )
+        streams = [storage.read_messages(names, damage, since) for storage in self._storages]
         yield from map(_unpacked, heapq.merge(*streams, key=lambda message: message.log_time))
 
-    def latest(self, topics: Collection[str], before: int, count: int = 1) -> list[BagMessage]:
+    def read_latest(self, topics: Collection[str], before: int, count: int = 1) -> list[BagMessage]:
         """Return the last messages of each topic before a time, in the order of log times.
 
         Args:
@@ -135,7 +139,9 @@ class Bag:
             BagError: the bag has no such topic.
         """
         last: dict[str, deque[BagMessage]] = defaultdict(lambda: deque(maxlen=count))
-        for message in takewhile(lambda each: each.log_time < before, self.messages(topics, [])):
+        for message in takewhile(
+            lambda each: each.log_time < before, self.read_messages(topics, [])
+        ):
             last[message.topic].append(message)
         return sorted(chain(*last.values()), key=lambda message: message.log_time)
 
@@ -151,7 +157,7 @@ class Bag:
                 f"{self.path} holds {topic.name} in the encoding {topic.encoding!r}: only cdr, "
                 f"what ROS 2 writes, can be read"
             )
-        store = self.definitions(topic)
+        store = self.find_definitions(topic)
         try:
             return store.deserialize_cdr(message.data, topic.type_name)
         except Exception as error:  # generated decoders may raise anything for wrong bytes
@@ -160,7 +166,7 @@ class Bag:
                 f"{topic.type_name}: {error}"
             ) from None
 
-    def definitions(self, topic: BagTopic) -> Typestore:
+    def find_definitions(self, topic: BagTopic) -> Typestore:
         """Return the definition of a topic's type: the bag's own, else that of Jazzy.
 
         Raises:
@@ -168,10 +174,10 @@ class Bag:
         """
         if topic.schema is not None:
             try:
-                return definitions(topic.type_name, topic.schema)
+                return parse_definitions(topic.type_name, topic.schema)
             except BagError as error:
                 raise BagError(f"{self.path}, {topic.name}: {error}") from None
-        store = jazzy_definitions()
+        store = load_jazzy_definitions()
         if topic.type_name not in store.fielddefs:
             raise BagError(
                 f"{self.path} holds {topic.name} of type {topic.type_name} without its "
@@ -208,19 +214,19 @@ def read_bag(path: str | Path, *further: Path) -> Bag:
     """
     path = Path(path)
     try:
-        return Bag(path, [open_storage(file) for file in (*bag_files(path), *further)])
+        return Bag(path, [open_storage(file) for file in (*find_bag_files(path), *further)])
     except OSError as error:
         raise BagError(f"{path} cannot be read: {error.strerror or error}") from None
 
 
-def describe(bag: Bag) -> str:
+def describe_bag(bag: Bag) -> str:
     """Tell path, times, topics with their rates and offered quality, then losses, marks, files.
 
     The times of marks are those since the start. All of the bag is read, for its faults.
     """
     start, faults = bag.start, list[str]()
     times: dict[str, tuple[int, int]] = {}  # ns, first and last of a topic
-    for message in bag.all_messages(faults):
+    for message in bag.read_all_messages(faults):
         first, _ = times.get(message.topic, (message.log_time, 0))
         times[message.topic] = first, message.log_time
     seconds = (bag.end - start) * 1e-9 if start is not None and bag.end is not None else 0.0
@@ -237,13 +243,17 @@ def describe(bag: Bag) -> str:
         quality = "; ".join(dict.fromkeys(map(_summary, topic.qos))) or "-"
         encoding = "" if topic.encoding == "cdr" else f" ({topic.encoding})"
         table.append((topic.name, topic.type_name + encoding, str(count), rate, quality))
-    lines += aligned(table, left=(0, 1, 4))
-    lines += _section("lost", [f"{count} of {topic}" for topic, count in bag.lost().items()])
-    marks = [f"{(time - (start or time)) * 1e-9:.3f} s  {text}" for time, text in bag.markers()]
+    lines += align_columns(table, left=(0, 1, 4))
+    lines += _section(
+        "lost", [f"{count} of {topic}" for topic, count in bag.count_losses().items()]
+    )
+    marks = [
+        f"{(time - (start or time)) * 1e-9:.3f} s  {text}" for time, text in bag.read_markers()
+    ]
     lines += _section("marked", marks)
     attached = bag.attachments.values()
     lines += _section("attached", [f"{each.name} ({len(each.data)} bytes)" for each in attached])
-    return "\n".join(printable(line) for line in lines)
+    return "\n".join(printable_line(line) for line in lines)
 
 
 def _summary(qos: Qos) -> str:

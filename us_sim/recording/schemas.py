@@ -21,13 +21,13 @@ _TYPE_NAME = re.compile(r"([a-zA-Z]\w*)/(?:msg/)?([a-zA-Z]\w*)")
 _Fields = dict[str, tuple[Any, list[Any]]]  # constants and fields, by type, as rosbags has them
 
 
-def normalized_type(name: str) -> str:
+def normalize_type(name: str) -> str:
     """Return ``pkg/msg/Type`` for ``pkg/Type`` of early ROS 2 bags, other names unchanged."""
     package, _, rest = name.partition("/")
     return f"{package}/msg/{rest}" if rest and "/" not in rest else name
 
 
-def schema_text(type_name: str) -> str:
+def make_schema(type_name: str) -> str:
     """Return the ``ros2msg`` schema of ``pkg/msg/Type``, followed by every type that it refers to.
 
     Raises:
@@ -36,7 +36,7 @@ def schema_text(type_name: str) -> str:
     return _installed(type_name, _prefixes()).generate_msgdef(type_name, ros_version=2)[0]
 
 
-def type_hash(type_name: str) -> str:
+def compute_type_hash(type_name: str) -> str:
     """Return the hash of ``pkg/msg/Type`` (REP 2016), as ROS 2 announces it with each endpoint.
 
     Raises:
@@ -46,7 +46,7 @@ def type_hash(type_name: str) -> str:
 
 
 @cache
-def definitions(type_name: str, text: str) -> Typestore:
+def parse_definitions(type_name: str, text: str) -> Typestore:
     """Parse the types that a schema's text defines.
 
     Raises:
@@ -64,14 +64,14 @@ def definitions(type_name: str, text: str) -> Typestore:
 
 
 @cache
-def jazzy_definitions() -> Typestore:
+def load_jazzy_definitions() -> Typestore:
     """Return the message types of ROS 2 Jazzy; the first call takes a twentieth of a second."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
-def stamped(type_name: str, stamp: int, frame_id: str, **fields: Any) -> memoryview:
+def serialize_stamped(type_name: str, stamp: int, frame_id: str, **fields: Any) -> memoryview:
     """Serialize a message of Jazzy with a header and these fields; ``stamp`` in ns since 1970."""
-    store = jazzy_definitions()
+    store = load_jazzy_definitions()
     time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
     header = store.types["std_msgs/msg/Header"](stamp=time, frame_id=frame_id)
     message = store.types[type_name](header=header, **fields)
@@ -115,7 +115,7 @@ def _definition(type_name: str, prefixes: str) -> _Fields:
         file = Path(prefix, "share", package, "msg", f"{name}.msg")
         if file.is_file():
             return get_types_from_msg(file.read_text(encoding="utf-8"), type_name)
-    known = jazzy_definitions().fielddefs
+    known = load_jazzy_definitions().fielddefs
     if type_name not in known:
         raise BagError(
             f"message type {type_name} is unknown: install the ROS 2 package {package} and source "

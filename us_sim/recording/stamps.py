@@ -8,7 +8,7 @@ from typing import Any
 from rosbags.interfaces import Nodetype
 
 from us_sim.errors import BagError
-from us_sim.recording.decoding import first_stamp_in, stamp_in
+from us_sim.recording.decoding import read_first_stamp, read_stamp
 from us_sim.recording.reader import Bag
 from us_sim.recording.topic import BagTopic
 
@@ -17,7 +17,7 @@ _HEADER = (Nodetype.NAME, "std_msgs/msg/Header")
 Stamp = Callable[[bytes], int | None]
 
 
-def stamp_reader(bag: Bag, topic: BagTopic) -> Stamp | None:
+def make_stamp_reader(bag: Bag, topic: BagTopic) -> Stamp | None:
     """Return a function from a message's bytes to its stamp in ns; None where it has no header.
 
     The type must begin with a header, or with a sequence of such, of which the first counts, as
@@ -26,7 +26,7 @@ def stamp_reader(bag: Bag, topic: BagTopic) -> Stamp | None:
     The function raises struct.error for a message that is too short to have a stamp.
     """
     try:
-        fields = bag.definitions(topic).fielddefs if topic.encoding == "cdr" else {}
+        fields = bag.find_definitions(topic).fielddefs if topic.encoding == "cdr" else {}
     except BagError:
         return None
 
@@ -36,7 +36,7 @@ def stamp_reader(bag: Bag, topic: BagTopic) -> Stamp | None:
 
     kind, content = first_field(topic.type_name)
     if (kind, content) == _HEADER:
-        return stamp_in
+        return read_stamp
     if kind == Nodetype.SEQUENCE and content[0][0] == Nodetype.NAME:
-        return first_stamp_in if first_field(content[0][1]) == _HEADER else None
+        return read_first_stamp if first_field(content[0][1]) == _HEADER else None
     return None

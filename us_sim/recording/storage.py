@@ -14,7 +14,7 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from us_sim.errors import BagError
 from us_sim.recording.mcap_storage import McapStorage
-from us_sim.recording.schemas import normalized_type
+from us_sim.recording.schemas import normalize_type
 from us_sim.recording.topic import BagMessage, BagTopic
 
 _SQLITE_MAGIC = b"SQLite format 3\0"
@@ -54,7 +54,7 @@ class SqliteStorage:
         except Exception as error:  # rosbags' own, SQLite's, and what foreign texts lead to
             raise self._damaged(error) from None
 
-    def messages(
+    def read_messages(
         self, topics: Collection[str], _: list[str] | None, since: int | None
     ) -> Iterator[BagMessage]:
         """Yield the messages of these topics, since a log time (ns), in the order of log times.
@@ -65,7 +65,7 @@ class SqliteStorage:
         wanted = [each for each in self._reader.connections if each.topic in topics]
         try:
             for connection, time, data in self._reader.messages(wanted, since):
-                type_name = normalized_type(connection.msgtype)
+                type_name = normalize_type(connection.msgtype)
                 yield BagMessage(connection.topic, type_name, int(time), int(time), bytes(data))
         except Exception as error:
             raise self._damaged(error) from None
@@ -79,7 +79,7 @@ def _topic(connection: Any) -> BagTopic:
     definition = connection.msgdef
     return BagTopic(
         name=connection.topic,
-        type_name=normalized_type(connection.msgtype),
+        type_name=normalize_type(connection.msgtype),
         message_count=connection.msgcount,
         qos=tuple(connection.ext.offered_qos_profiles),
         type_hash=connection.digest or "",
@@ -91,7 +91,7 @@ def _topic(connection: Any) -> BagTopic:
 Storage = McapStorage | SqliteStorage
 
 
-def bag_files(path: Path) -> list[Path]:
+def find_bag_files(path: Path) -> list[Path]:
     """Find the files that a bag consists of.
 
     Raises:

@@ -55,14 +55,14 @@ def qos_of(profile: Any) -> Qos:
     )
 
 
-def as_yaml(document: object) -> str:
+def to_yaml(document: object) -> str:
     """Write a document as YAML, its keys in their order."""
     return yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
 
 
 def qos_to_yaml(profiles: Iterable[Qos]) -> str:
     """Write the YAML list that rosbag2 puts in a channel's ``offered_qos_profiles``."""
-    return as_yaml(dump_qos_v9([*profiles])).rstrip()
+    return to_yaml(dump_qos_v9([*profiles])).rstrip()
 
 
 def qos_from_yaml(document: Any, where: str = "offered_qos_profiles") -> tuple[Qos, ...]:
@@ -103,7 +103,7 @@ class BagTopic:
         """Return whether all its publishers kept messages for those who come later."""
         return {q.durability for q in self.qos} == {QosDurability.TRANSIENT_LOCAL}
 
-    def joined(self, other: BagTopic, bag: str) -> BagTopic:
+    def merge_topic(self, other: BagTopic, bag: str) -> BagTopic:
         """Return this topic with the messages of another channel or file of the same name.
 
         Raises:

@@ -12,14 +12,14 @@ from functools import partial
 from rosbags.interfaces import Qos
 
 from us_sim.errors import BagError
-from us_sim.recording.schemas import schema_text, type_hash
+from us_sim.recording.schemas import compute_type_hash, make_schema
 from us_sim.recording.topic import LOST
 from us_sim.recording.writer import BagWriter
 
 _FLUSH = 0.2  # s, after which messages are handed to the operating system
 _PAUSE = 0.05  # s, in which messages gather: to be woken for each costs whoever has them time
 _RETRY = 1.0  # s, between tries to write to a disk that was full
-_BATCH = 512 * 1024  # bytes that may wait where `put` waits for the disk
+_BATCH = 512 * 1024  # bytes that may wait where `put_message` waits for the disk
 
 
 class WriteBehind:
@@ -30,7 +30,7 @@ class WriteBehind:
 
     Args:
         bag: open, and used by nobody else from now on.
-        max_cache_size: bytes of messages that may wait to be written; 0 makes `put` wait for the
+        max_cache_size: bytes of messages that may wait to be written; 0 makes `put_message` wait for the
             disk instead of losing any, unless the disk is full.
     """
 
@@ -60,7 +60,7 @@ class WriteBehind:
         with self._lock:
             return self._lost.copy()
 
-    def lose(self, topic: str, count: int) -> None:
+    def count_lost(self, topic: str, count: int) -> None:
         """Count messages that were lost, before they came here or since."""
         with self._lock:
             self._lost[topic] += count
@@ -71,10 +71,12 @@ class WriteBehind:
         Raises:
             BagError: the type is unknown.
         """
-        schema, digest = schema_text(type_name), type_hash(type_name)
+        schema, digest = make_schema(type_name), compute_type_hash(type_name)
         self._queue.put(partial(self._bag.add_topic, topic, type_name, qos, digest, schema=schema))
 
-    def put(self, topic: str, data: bytes, log_time: int, publish_time: int | None = None) -> bool:
+    def put_message(
+        self, topic: str, data: bytes, log_time: int, publish_time: int | None = None
+    ) -> bool:
         """Have a serialized message written; False if the queue is full, and it is lost.
 
         Args:
@@ -92,12 +94,12 @@ class WriteBehind:
             given = topic, data, log_time, publish_time, self._sequences[topic]
             self._queue.put(partial(self._write, *given))
         else:
-            self.lose(topic, 1)
+            self.count_lost(topic, 1)
         return fits
 
-    def attach(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
+    def attach_file(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
         """Put a file into the bag."""
-        self._queue.put(partial(self._bag.attach, name, media_type, data, time_ns))
+        self._queue.put(partial(self._bag.attach_file, name, media_type, data, time_ns))
 
     def close(self) -> None:
         """Write all waiting messages, and close the bag.
@@ -110,7 +112,7 @@ class WriteBehind:
         self._thread.join()
         if lost := self.losses:
             note = {topic: str(count) for topic, count in lost.items()}
-            self._try(partial(self._bag.note, LOST, note))
+            self._try(partial(self._bag.write_metadata, LOST, note))
         self._bag.close()
 
     def _run(self) -> None:
@@ -137,9 +139,9 @@ class WriteBehind:
         try:
             if self._bag.problem:
                 raise BagError(self._bag.problem)
-            self._bag.write(topic, data, log, publish, number)
+            self._bag.write_message(topic, data, log, publish, number)
         except Exception:
-            self.lose(topic, 1)
+            self.count_lost(topic, 1)
             raise
 
     def _try(self, work: Callable[[], None]) -> None:

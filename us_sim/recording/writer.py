@@ -5,7 +5,7 @@
 >>> file = tempfile.mkdtemp() + "/session.mcap"
 >>> with BagWriter(file, compression="zstd") as writer:
 ...     writer.add_topic("/note", "std_msgs/msg/String")
-...     writer.write("/note", bytes.fromhex("00010000 03000000 686900"), 1_700_000_000_000_000_000)
+...     writer.write_message("/note", bytes.fromhex("00010000 03000000 686900"), 1_700_000_000_000_000_000)
 >>> open(file, "rb").read(8)
 b'\\x89MCAP0\\r\\n'
 """
@@ -28,9 +28,9 @@ from us_sim import __version__
 from us_sim.errors import BagError
 from us_sim.recording.mcap_storage import REMEDY
 from us_sim.recording.metadata import INFORMATION, METADATA, NO_TIME, bag_information
-from us_sim.recording.schemas import definitions, schema_text
-from us_sim.recording.topic import BagTopic, as_yaml, qos_to_yaml
-from us_sim.settings.spelling import counted
+from us_sim.recording.schemas import make_schema, parse_definitions
+from us_sim.recording.topic import BagTopic, qos_to_yaml, to_yaml
+from us_sim.settings.spelling import format_count
 from us_sim.share import full_path
 
 _CHUNK_SIZE = 2 * 1024 * 1024  # bytes; the writer keeps an index of each chunk in memory
@@ -200,9 +200,9 @@ class BagWriter:
             qualities = tuple(dict.fromkeys((*known.qos, *profiles)))
             self._topics[topic] = replace(known, qos=qualities)
             return
-        schema = schema_text(type_name) if schema is None else schema
+        schema = make_schema(type_name) if schema is None else schema
         if type_hash is None:
-            type_hash = definitions(type_name, schema).hash_rihs01(type_name)
+            type_hash = parse_definitions(type_name, schema).hash_rihs01(type_name)
         if type_name not in self._schemas:
             content = schema.encode()
             self._schemas[type_name] = self._writer.register_schema(type_name, "ros2msg", content)
@@ -211,7 +211,7 @@ class BagWriter:
         self._channels[topic] = self._writer.register_channel(topic, "cdr", schema_id, about)
         self._topics[topic] = BagTopic(topic, type_name, 0, profiles, type_hash)
 
-    def write(
+    def write_message(
         self,
         topic: str,
         cdr: bytes | bytearray | memoryview,
@@ -250,7 +250,7 @@ class BagWriter:
         self._start = min(self._start, log_time_ns)
         self._end = max(self._end, log_time_ns)
 
-    def attach(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
+    def attach_file(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
         """Put a file into the bag, such as the scene that is recorded.
 
         ``media_type`` is such as ``text/plain``; ``time_ns``, ns since the epoch, says of when the
@@ -263,7 +263,7 @@ class BagWriter:
         self._writer.add_attachment(time_ns, time_ns, name, media_type, data)
         self.flush()
 
-    def note(self, name: str, values: Mapping[str, str]) -> None:
+    def write_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Put texts by their names into the file, as a metadata record of MCAP.
 
         Raises:
@@ -304,12 +304,12 @@ class BagWriter:
         if not self.path.exists():
             problems.append(
                 f"{self.path} was removed or moved away while it was recorded, with "
-                f"{counted(self.message_count, 'message')}"
+                f"{format_count(self.message_count, 'message')}"
             )
         elif self._metadata_file is not None:
             try:
                 with self._metadata_file.open("x", encoding="utf-8") as file:
-                    file.write(as_yaml({INFORMATION: self._information()}))
+                    file.write(to_yaml({INFORMATION: self._information()}))
             except OSError as error:
                 if not isinstance(error, FileExistsError):
                     self._metadata_file.unlink(missing_ok=True)
@@ -335,7 +335,7 @@ class BagWriter:
         return f"{self.path} cannot be written ({self._file.error.strerror})"
 
     def _add_metadata(self) -> None:
-        information = {"serialized_metadata": as_yaml(self._information())}
+        information = {"serialized_metadata": to_yaml(self._information())}
         self._writer.add_metadata("rosbag2", information)
         self._writer.flush()
 

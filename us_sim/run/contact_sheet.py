@@ -14,11 +14,11 @@ from matplotlib.figure import Figure
 from us_sim.errors import BagError
 from us_sim.run.session_summary import IMAGE, Session
 from us_sim.run.session_tables import SECOND
-from us_sim.scene.building import probe_of
+from us_sim.scene.building import build_probe
 from us_sim.scene.scene import Scene
 from us_sim.scoring.lumen import LumenAreas
-from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
-from us_sim.volume.structure_names import anatomical_colour
+from us_sim.slicing.drawing.label_outlines import snap_to_border, trace_label_outlines
+from us_sim.volume.structure_names import choose_colour
 
 
 def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file: Path) -> None:
@@ -32,12 +32,12 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
     figure = Figure(figsize=(15, 5.5 if areas is None else 9.0), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(len(heights), 3, height_ratios=heights)
-    probe, first = probe_of(scene), min(session.poses)
+    probe, first = build_probe(scene), min(session.poses)
     corners = np.array([[-0.5, -0.5, 0, 1], [probe.columns - 0.5, probe.rows - 0.5, 0, 1]])
     (left, _, top), (right, _, bottom) = 1e3 * (corners @ probe.image_to_probe.T)[:, :3]
-    numbers, scanner = session.scanner_of_vessels(scene)
-    lumens = {n: anatomical_colour(name) for name in numbers for n in numbers[name]}
-    images = session.images_at({*moments.values()})
+    numbers, scanner = session.find_vessels(scene)
+    lumens = {n: choose_colour(name) for name in numbers for n in numbers[name]}
+    images = session.read_images({*moments.values()})
     times = [(stamp - first) / SECOND for stamp in moments.values()]
     for i, (title, stamp) in enumerate(moments.items()):
         axes, pose = figure.add_subplot(grid[0, i]), session.poses[stamp]
@@ -46,11 +46,11 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
         depth = 1e3 * float(pose.position[2])
         if scanner is not None and stamp in session.nodes and depth > 0.0:
             # Through air nothing is seen.
-            frame = scanner.frame(pose, session.nodes[stamp])
+            frame = scanner.make_frame(pose, session.nodes[stamp])
             scale = np.array([right - left, bottom - top]) / frame.labels.shape[::-1]
             for label, colour in lumens.items():
-                refine = partial(onto_border, frame)
-                for outline in label_outlines(frame.labels, label, refine=refine):
+                refine = partial(snap_to_border, frame)
+                for outline in trace_label_outlines(frame.labels, label, refine=refine):
                     x, y = ((outline + 0.5) * scale + (left, top)).T
                     axes.fill(x, y, fill=False, ec=colour, lw=1)
             axes.set(xlim=(left, right), ylim=(bottom, top))
@@ -68,7 +68,7 @@ def pick_moments(session: Session) -> dict[str, int]:
     Raises:
         BagError: the session holds no image with a pose.
     """
-    stamps = [stamp for stamp in session.stamps(IMAGE) if stamp in session.poses]
+    stamps = [stamp for stamp in session.list_stamps(IMAGE) if stamp in session.poses]
     if not stamps:
         raise BagError("the session holds no image with a pose, so there is nothing to show")
     depth = np.array([session.poses[stamp].position[2] for stamp in stamps])
@@ -81,7 +81,7 @@ def pick_moments(session: Session) -> dict[str, int]:
 
 def _plot_areas(axes: Any, areas: LumenAreas, moments: Sequence[float]) -> None:
     for name in areas.area:
-        colour, percent = anatomical_colour(name), 100 * areas.fraction(name)
+        colour, percent = choose_colour(name), 100 * areas.compute_fraction(name)
         axes.plot(areas.time, percent, color=colour, label=f"{name} lumen", lw=2)
     axes.set(xlabel="time, s", ylabel="area, % of the same plane at rest")
     axes.set_ylim(bottom=0)

@@ -2,12 +2,12 @@
 
 The arguments after ``--ros-args`` of the command line are for all nodes that it starts.
 
->>> from us_sim.run.domain import namespace, ros_arguments, take_ros_arguments
+>>> from us_sim.run.domain import get_namespace, get_ros_arguments, take_ros_arguments
 >>> take_ros_arguments(["run", "arm", "--ros-args", "-r", "__ns:=/a", "--", "-x"])
 ['run', 'arm', '-x']
->>> ros_arguments(), namespace()
+>>> get_ros_arguments(), get_namespace()
 (['-r', '__ns:=/a'], '/a')
->>> take_ros_arguments([]), ros_arguments(), namespace()
+>>> take_ros_arguments([]), get_ros_arguments(), get_namespace()
 ([], [], '/')
 """
 
@@ -48,29 +48,29 @@ def take_ros_arguments(args: Sequence[str]) -> list[str]:
     return own
 
 
-def ros_arguments() -> list[str]:
+def get_ros_arguments() -> list[str]:
     """Return those of the command that runs, without ``--ros-args``."""
     return [*_taken]
 
 
-def namespace() -> str:
+def get_namespace() -> str:
     """Return the namespace that they put nodes in: the first counts, as in rcl."""
     rule = "__ns:="
     return next((a.removeprefix(rule) for a in _taken if a.startswith(rule)), "/")
 
 
-def domain() -> str:
+def get_domain() -> str:
     """Return the ROS domain's number, as the environment says it."""
     return os.environ.get("ROS_DOMAIN_ID") or "0"
 
 
-def enclave_of(node: str) -> str:
+def name_enclave(node: str) -> str:
     """Return the place where ROS 2's security finds a node's keys."""
     return f"/us_sim/{node}"
 
 
 @contextlib.contextmanager
-def alone_on_domain(space: str | None = None) -> Iterator[None]:
+def lock_domain(space: str | None = None) -> Iterator[None]:
     """Have the domain to oneself, in a namespace (that of ``--ros-args``) and on this host.
 
     Raises:
@@ -78,20 +78,20 @@ def alone_on_domain(space: str | None = None) -> Iterator[None]:
     """
     from filelock import FileLock, Timeout
 
-    names = ".".join([domain(), *filter(None, (space or namespace()).split("/"))])
+    names = ".".join([get_domain(), *filter(None, (space or get_namespace()).split("/"))])
     file = Path(tempfile.gettempdir()) / f"us_sim_domain_{names}.lock"
     try:
         with FileLock(file, timeout=0, mode=0o666):  # of all users of this host
             yield
     except Timeout:
         raise UsSimError(
-            f"another simulation runs already on ROS domain {domain()} of this host ({file} is "
+            f"another simulation runs already on ROS domain {get_domain()} of this host ({file} is "
             f"locked): end it, or set ROS_DOMAIN_ID to another number for this one, or give it a "
             f"namespace of its own (--ros-args -r __ns:=/left)"
         ) from None
 
 
-def ros_context(number: int | None = None) -> Context:
+def make_ros_context(number: int | None = None) -> Context:
     """Return a context that handles no signals, on the domain of this number or the environment's.
 
     Raises:
@@ -101,13 +101,13 @@ def ros_context(number: int | None = None) -> Context:
     from rclpy.context import Context
     from rclpy.signals import SignalHandlerOptions
 
-    from us_sim.nodes import announce_often, ros_refusal
+    from us_sim.nodes import announce_often, explain_ros_error
 
     announce_often()
     context, silent = Context(), SignalHandlerOptions.NO
-    given = [BEGIN, "--enclave", enclave_of("session_control"), *ros_arguments()]
+    given = [BEGIN, "--enclave", name_enclave("session_control"), *get_ros_arguments()]
     try:
         rclpy.init(args=given, context=context, domain_id=number, signal_handler_options=silent)
     except Exception as error:  # what rcl raises differs between its versions
-        raise ros_refusal(error) from error
+        raise explain_ros_error(error) from error
     return context

@@ -11,19 +11,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.settings import RECORDER, VIEWER, PlayerSettings, checked_parameters
+from us_sim.nodes.settings import RECORDER, VIEWER, PlayerSettings, check_parameters
 from us_sim.progress import Progress
-from us_sim.run.domain import alone_on_domain, domain, ros_arguments
+from us_sim.run.domain import get_domain, get_ros_arguments, lock_domain
 from us_sim.run.plan import (
     NodeProcess,
     Parameters,
     Plan,
-    Request,
-    plan_of,
+    RunRequest,
+    make_plan,
+    plan_viewer,
     prepare_scene,
     require_free_port,
     require_new,
-    viewer_process,
 )
 from us_sim.run.simulation import Simulation
 from us_sim.run.supervision import (
@@ -32,7 +32,7 @@ from us_sim.run.supervision import (
     Outcome,
     SupervisionSettings,
     Supervisor,
-    say,
+    print_above_bar,
 )
 from us_sim.scene.scene import Scene
 from us_sim.settings.viewer import ViewerSettings
@@ -46,11 +46,11 @@ SETTLE_S = 1.2  # after the path's end: for the last images and each node's last
 _LONG_START_S = 15.0  # longer than a start takes that compiles nothing
 
 
-def follow(
+def follow_plan(
     plan: Plan,
     log: Path | None,
     settings: SupervisionSettings,
-    request: Request | None = None,
+    request: RunRequest | None = None,
 ) -> Outcome:
     """Start the plan's processes and stay with them until they are done; return how it went.
 
@@ -60,23 +60,23 @@ def follow(
     Raises:
         UsSimError: a node cannot start, or another simulation runs on this domain.
     """
-    with contextlib.nullcontext() if request is None else alone_on_domain():
+    with contextlib.nullcontext() if request is None else lock_domain():
         supervisor = Supervisor(settings, log)
         try:
-            supervisor.start(plan)
+            supervisor.start_plan(plan)
             update = supervisor.update
             if request is not None:
                 update = Simulation(request, supervisor).update
             _await_all(update, supervisor)
             _stay(update, supervisor)
         except KeyboardInterrupt:
-            supervisor.end()
-            if supervisor.plan.processes and (lost := supervisor.outcome().sentence()):
-                say(lost)
+            supervisor.end_plan()
+            if supervisor.plan.processes and (lost := supervisor.make_outcome().describe_losses()):
+                print_above_bar(lost)
             raise
         finally:
-            supervisor.end()
-        return supervisor.outcome()
+            supervisor.end_plan()
+        return supervisor.make_outcome()
 
 
 def _await_all(update: Callable[[], None], supervisor: Supervisor) -> None:
@@ -114,7 +114,7 @@ def _status(plan: Plan, monitor: SessionMonitor) -> str:
         told.append(f"{player['played']} of {plan.poses} played")
     elif player.get("state") == "playing":
         told.append(f"{player.get('position')} of {player.get('duration')} s played")
-    if images := monitor.count(IMAGER, IMAGES):
+    if images := monitor.count_messages(IMAGER, IMAGES):
         latency, rate = slicer.get("latency_p99_ms", "?"), slicer.get("rate_hz", "?")
         told.append(f"{images} images, {rate}/s, p99 latency {latency} ms")
     elif slicer.get("received", "0") != "0":
@@ -122,7 +122,7 @@ def _status(plan: Plan, monitor: SessionMonitor) -> str:
     elif IMAGER in plan.nodes:
         told.append(f"waiting for {player.get('awaited', 'poses')}")
     elif player.get("state") == "waiting":
-        told.append(f"waiting for the simulation on ROS domain {domain()}")
+        told.append(f"waiting for the simulation on ROS domain {get_domain()}")
     if port := viewer.get("port"):
         host = str(next(each for each in plan.processes if each.node == VIEWER).parameters["host"])
         address = f"http://{f'[{host}]' if ':' in host else host}:{port}/"
@@ -130,13 +130,13 @@ def _status(plan: Plan, monitor: SessionMonitor) -> str:
     return "; ".join(told)
 
 
-def dry_run(request: Request) -> str:
-    """Return what :func:`run` would start or leave out, and why, one line each."""
+def dry_run(request: RunRequest) -> str:
+    """Return what :func:`run_scene` would start or leave out, and why, one line each."""
     scene, view, path, record = request.scene, request.view, request.path, request.record
     if record is not None:
         require_new(full_path(record))
-    plan_of(request)
-    rows = [(part.node, part.needed, part.reason) for part in scene.parts()]
+    make_plan(request)
+    rows = [(part.node, part.needed, part.reason) for part in scene.list_parts()]
     source = f"no --path: poses come from `{scene.tracker.source.name}`"
     rows.append(("path_player", path is not None, f"plays {path}" if path else source))
     rows.append((RECORDER, record is not None, f"records to {record}" if record else "no --record"))
@@ -152,7 +152,7 @@ def dry_run(request: Request) -> str:
     )
 
 
-def run(request: Request, supervision: SupervisionSettings) -> int:
+def run_scene(request: RunRequest, supervision: SupervisionSettings) -> int:
     """Run a scene until its path ends, the duration is over, or Ctrl-C.
 
     Raises:
@@ -169,22 +169,22 @@ def run(request: Request, supervision: SupervisionSettings) -> int:
     return _require_nothing_lost(outcome)
 
 
-def _simulate(request: Request, log: Path | None, supervision: SupervisionSettings) -> Outcome:
-    plan = plan_of(request)
+def _simulate(request: RunRequest, log: Path | None, supervision: SupervisionSettings) -> Outcome:
+    plan = make_plan(request)
     require_free_port(plan)
     prepare_scene(request.scene, request.path, plan.topic)
     if log is not None:
         log.parent.mkdir(parents=True, exist_ok=True)
-    return follow(plan, log, supervision, request)
+    return follow_plan(plan, log, supervision, request)
 
 
-def demo(request: Request, out: Path, supervision: SupervisionSettings) -> int:
+def run_demo(request: RunRequest, out: Path, supervision: SupervisionSettings) -> int:
     """Replay a path through a scene's nodes; recording, contact sheet and summary in ``out``.
 
     Raises:
-        UsSimError: as for `run`, or ``out`` already holds a session.
+        UsSimError: as for `run_scene`, or ``out`` already holds a session.
     """
-    if ros_arguments():
+    if get_ros_arguments():
         raise UsSimError(
             "--ros-args: the demo's report is of topics under their usual names: use `us-sim run "
             "--record FILE` where they have others"
@@ -198,7 +198,7 @@ def demo(request: Request, out: Path, supervision: SupervisionSettings) -> int:
     try:
         _report(scene, out, outcome, time.monotonic() - started)
     except UsSimError as error:
-        why = filter(None, [outcome.sentence(), str(error)])
+        why = filter(None, [outcome.describe_losses(), str(error)])
         raise UsSimError("; ".join(why)) from error
     return _require_nothing_lost(outcome)
 
@@ -209,7 +209,7 @@ def view_running(view: ViewerSettings, given: Parameters, supervision: Supervisi
     Raises:
         UsSimError: the viewer cannot start, or one is there already.
     """
-    viewer = viewer_process(view, checked_parameters("viewer", None, given.get("viewer", {})))
+    viewer = plan_viewer(view, check_parameters("viewer", None, given.get("viewer", {})))
     others = sorted(set(given) - {viewer.node})
     if others:
         raise UsSimError(
@@ -218,10 +218,12 @@ def view_running(view: ViewerSettings, given: Parameters, supervision: Supervisi
         )
     plan = Plan([viewer])
     require_free_port(plan)
-    return _require_nothing_lost(follow(plan, None, supervision))
+    return _require_nothing_lost(follow_plan(plan, None, supervision))
 
 
-def play(bag: Path, player: PlayerSettings, *, topic: str, everything: bool, lockstep: bool) -> int:
+def play_bag(
+    bag: Path, player: PlayerSettings, *, topic: str, everything: bool, lockstep: bool
+) -> int:
     """Play a bag into whatever runs on this ROS domain.
 
     Raises:
@@ -238,11 +240,11 @@ def play(bag: Path, player: PlayerSettings, *, topic: str, everything: bool, loc
         poses = len(read_path(bag, topic or None, option="--topic"))
         process = NodeProcess("path_player", settings | {"topic": topic, "lockstep": lockstep})
     plan = Plan([process], poses, player=process.node)
-    return _require_nothing_lost(follow(plan, None, SupervisionSettings()))
+    return _require_nothing_lost(follow_plan(plan, None, SupervisionSettings()))
 
 
 def _require_nothing_lost(outcome: Outcome) -> int:
-    if lost := outcome.sentence():
+    if lost := outcome.describe_losses():
         raise UsSimError(lost)
     return 0
 
@@ -254,8 +256,8 @@ def _report(scene: Scene, out: Path, outcome: Outcome, wall: float) -> None:
     with Progress("measuring the recording", 100, "%") as bar:
         session = read_session(*outcome.files)
         meter = session.measure_lumens(scene, 120, lambda done: bar.update(50 * done))
-        areas = meter.areas() if meter is not None else None
-        summary = session.summary(areas)
+        areas = meter.collect_areas() if meter is not None else None
+        summary = session.summarize(areas)
         summary |= {"scene": scene.name, "startup_s": round(outcome.startup, 2)}
         summary |= {"wall_s": round(wall, 2), "lost": list(outcome.losses)}
         bar.update(50, "drawing the contact sheet")

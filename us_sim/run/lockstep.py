@@ -14,12 +14,12 @@ from threadpoolctl import threadpool_limits
 
 from us_sim.errors import UsSimError
 from us_sim.progress import Progress
-from us_sim.run.domain import ros_context
-from us_sim.run.plan import NodeProcess, Request, plan_of, prepare_scene
+from us_sim.run.domain import make_ros_context
+from us_sim.run.plan import NodeProcess, RunRequest, make_plan, prepare_scene
 from us_sim.run.processes import prepare_ros
-from us_sim.scene.building import volume_of
+from us_sim.scene.building import load_volume
 from us_sim.scene.scene import Scene
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import format_count
 
 QUIET_S = 0.25  # silence after which everything that was sent has been taken
 _RECORDED: dict[str, object] = {
@@ -29,7 +29,7 @@ _RECORDED: dict[str, object] = {
 }
 
 
-def render(request: Request, out: Path, *, truth: bool = False) -> int:
+def render_scene(request: RunRequest, out: Path, *, truth: bool = False) -> int:
     """Run a scene along its path: ``out/images/*.png`` and ``out/session.mcap``.
 
     With ``truth`` what is known of each image is written beside it, too.
@@ -42,7 +42,7 @@ def render(request: Request, out: Path, *, truth: bool = False) -> int:
     if out.exists() and any(out.iterdir()):
         raise UsSimError(f"--out {out}: is not empty; choose another folder")
     out.mkdir(parents=True, exist_ok=True)
-    plan = plan_of(request)
+    plan = make_plan(request)
     prepare_scene(request.scene, request.path, plan.topic)
     folders = _make_truth_folders(request.scene, out) if truth else {}
     recorder, *nodes = plan.processes
@@ -54,7 +54,7 @@ def render(request: Request, out: Path, *, truth: bool = False) -> int:
     ]
     with Progress("rendering", plan.poses, "images") as bar:
         count = _run(processes, bar.update, [*folders])
-    print(f"{counted(count, 'image')} in {out / 'images'}, all messages in {request.record}")
+    print(f"{format_count(count, 'image')} in {out / 'images'}, all messages in {request.record}")
     for what, folder in folders.items():
         print(f"the {what} of each in {folder}")
     return 0
@@ -68,7 +68,7 @@ def _make_truth_folders(scene: Scene, out: Path) -> dict[str, Path]:
     Raises:
         UsSimError: nothing is known of them.
     """
-    volume = volume_of(scene)
+    volume = load_volume(scene)
     folders = {}
     if volume.labels is not None:
         folders["labels"] = out / "labels"
@@ -93,7 +93,7 @@ def _run(processes: list[NodeProcess], progress: Callable[[int], None], truth: l
     """
     from rclpy.executors import SingleThreadedExecutor
 
-    context = ros_context(None if "ROS_DOMAIN_ID" in os.environ else 1 + os.getpid() % 100)
+    context = make_ros_context(None if "ROS_DOMAIN_ID" in os.environ else 1 + os.getpid() % 100)
     executor = SingleThreadedExecutor(context=context)
     nodes: list[Any] = []
     try:

@@ -1,6 +1,6 @@
 """The processes of a run: the nodes of a scene with their parameters, a recorder, a player, a page.
 
-A `Request` says what a person wants; `plan_of` makes a `Plan` of processes from it.
+A `RunRequest` says what a person wants; `make_plan` makes a `Plan` of processes from it.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from typing import Any
 import yaml
 
 from us_sim.errors import SceneError, SettingsError, UsSimError
-from us_sim.nodes.settings import RECORDER, VIEWER, SessionRecorderSettings, checked_parameters
+from us_sim.nodes.settings import RECORDER, VIEWER, SessionRecorderSettings, check_parameters
 from us_sim.progress import late_progress
-from us_sim.run.domain import enclave_of, namespace, ros_arguments
-from us_sim.scene.building import path_of, volume_of
-from us_sim.scene.reading import check_names
+from us_sim.run.domain import get_namespace, get_ros_arguments, name_enclave
+from us_sim.scene.building import load_path, load_volume
+from us_sim.scene.reading import check_structure_names
 from us_sim.scene.scene import Scene
 from us_sim.settings.setting import rules_of
 from us_sim.settings.viewer import TOKEN, ViewerSettings
 from us_sim.share import full_path
-from us_sim.viewer.server import require_free
+from us_sim.viewer.server import require_free_address
 
 Parameters = dict[str, dict[str, str]]  # parameters given by a person: YAML texts by node and name
 
@@ -46,14 +46,14 @@ class NodeProcess:
 
     def arguments(self) -> list[str]:
         """List its ROS arguments: its enclave, those that all nodes get, and its parameters."""
-        arguments = ["--ros-args", "--enclave", enclave_of(self.node), *ros_arguments()]
+        arguments = ["--ros-args", "--enclave", name_enclave(self.node), *get_ros_arguments()]
         for name, value in self.parameters.items():
             arguments += ["-p", f"{name}:={json.dumps(value)}"]
         return arguments
 
 
 @dataclass(frozen=True)
-class Request:
+class RunRequest:
     """A scene to run, with its recording, its path and its page."""
 
     scene: Scene
@@ -70,7 +70,7 @@ class Request:
     results: str | None = None  # folder, or address of fsspec, that they are written to
     is_changed: bool = False  # while it ran: parameters may be of nodes that do not run now
 
-    def with_path(self) -> Request:
+    def with_path(self) -> RunRequest:
         """Return the same with the scene's own path, where no other is to be played.
 
         Raises:
@@ -82,7 +82,7 @@ class Request:
             raise SceneError(f"{self.scene.origin}: path: is missing; name a bag with --path")
         return replace(self, path=Path(self.scene.path))
 
-    def with_scene(self, scene: Scene) -> Request:
+    def with_scene(self, scene: Scene) -> RunRequest:
         """Return a request of another scene, in which nothing is recorded or played yet.
 
         Parameters of the scene's nodes were given for the scene before.
@@ -91,7 +91,7 @@ class Request:
         kept = {node: given for node, given in self.parameters.items() if node in of_any_scene}
         return replace(self.without_replay(), scene=scene, parameters=kept, record=None)
 
-    def without_replay(self) -> Request:
+    def without_replay(self) -> RunRequest:
         """Return the same with nothing played."""
         return replace(self, path=None, topic=None, everything=False, playing={}, is_changed=True)
 
@@ -115,7 +115,9 @@ def require_free_port(plan: Plan) -> None:
     """Raise UsSimError where the page's address or port cannot be listened at."""
     for process in plan.processes:
         if process.node == VIEWER:
-            require_free(str(process.parameters["host"]), int(str(process.parameters["port"])))
+            require_free_address(
+                str(process.parameters["host"]), int(str(process.parameters["port"]))
+            )
 
 
 def require_new(recording: Path) -> None:
@@ -128,7 +130,7 @@ def require_new(recording: Path) -> None:
         raise SettingsError(f"record: {recording}: there is no such folder; make it first")
 
 
-def goes_on(running: NodeProcess, wanted: NodeProcess | None) -> bool:
+def can_continue(running: NodeProcess, wanted: NodeProcess | None) -> bool:
     """Tell whether a process can stay when another plan wants its node.
 
     Those that record and play follow most parameters while they run.
@@ -140,7 +142,7 @@ def goes_on(running: NodeProcess, wanted: NodeProcess | None) -> bool:
     return all(before.get(name) == after.get(name) for name in decisive[running.node])
 
 
-def plan_of(request: Request) -> Plan:
+def make_plan(request: RunRequest) -> Plan:
     """Plan the processes that run a scene as requested.
 
     The scene's own recording is played, and its end held, where that is its tracker.
@@ -160,11 +162,11 @@ def plan_of(request: Request) -> Plan:
     played = "" if request.path is None else str(full_path(request.path))
 
     def taken(node: str) -> dict[str, object]:
-        return checked_parameters(node, scene, given.pop(node, {}))
+        return check_parameters(node, scene, given.pop(node, {}))
 
     processes = []
     if request.view is not None:  # it goes first: a page can load while tissue is built
-        processes.append(viewer_process(request.view, taken(VIEWER)))
+        processes.append(plan_viewer(request.view, taken(VIEWER)))
     recorder = taken(RECORDER) if request.record is not None or request.is_changed else {}
     player = taken("path_player") if played or request.is_changed else {}
     settings: dict[str, object]
@@ -182,7 +184,7 @@ def plan_of(request: Request) -> Plan:
         settings |= {"path": played} if played else {}
         recorder = settings | recorder
         processes.append(NodeProcess(RECORDER, recorder))
-    needed = [part.node for part in scene.parts() if part.needed]
+    needed = [part.node for part in scene.list_parts() if part.needed]
     for node in needed:
         is_played = node == "probe_tracker" and (played or request.by_hand)
         source = {"source": "pose"} if is_played else {}
@@ -200,13 +202,13 @@ def plan_of(request: Request) -> Plan:
         recorder["parameters"] = yaml.safe_dump(document, sort_keys=False)
     if request.path is None:
         return Plan(processes, duration=request.duration)
-    path = path_of(scene, request.path, request.topic or str(player.get("topic") or "") or None)
-    topics, space = ["tracker/pose", *scene.ready_topics], namespace()
-    recording = recorder_of(processes)
+    path = load_path(scene, request.path, request.topic or str(player.get("topic") or "") or None)
+    topics, space = ["tracker/pose", *scene.ready_topics], get_namespace()
+    recording = find_recorder(processes)
     recorded = [
         each
         for each in topics
-        if recording and recording.records(posixpath.join(space, each), space)
+        if recording and recording.records_topic(posixpath.join(space, each), space)
     ]
     settings = {"path": played, "topic": path.topic, "await_topics": topics}
     settings |= {"await_recorded": recorded or [""], **request.playing}  # [] has no type
@@ -216,7 +218,7 @@ def plan_of(request: Request) -> Plan:
     return Plan(processes, poses, request.duration, topic=path.topic)
 
 
-def viewer_process(view: ViewerSettings, given: dict[str, object] | None = None) -> NodeProcess:
+def plan_viewer(view: ViewerSettings, given: dict[str, object] | None = None) -> NodeProcess:
     """Return what shows the simulation in browsers, at an address that it says itself."""
     settings: dict[str, object] = {"host": view.host, "port": view.port}
     if view.recordings:
@@ -229,7 +231,7 @@ _TOKEN = secrets.token_urlsafe(16)
 """One for as long as this program runs, so that pages find a viewer that was started again."""
 
 
-def recorder_of(processes: Iterable[NodeProcess]) -> SessionRecorderSettings | None:
+def find_recorder(processes: Iterable[NodeProcess]) -> SessionRecorderSettings | None:
     """Return the settings of the recorder among processes."""
     for process in processes:
         if process.node == RECORDER:
@@ -250,19 +252,19 @@ def prepare_scene(scene: Scene, path: Path | None = None, topic: str | None = No
         UsSimError: the volume cannot be read, lacks what the scene names, or no image along the
             path shows any of it.
     """
-    check_names(scene)
+    check_structure_names(scene)
     phantom = scene.volume.phantom
     if path is None and phantom is not None:
-        from us_sim.volume.phantom.phantom import is_phantom_kept
+        from us_sim.volume.phantom.phantom import is_phantom_cached
 
-        if is_phantom_kept(phantom, scene.volume.seed, scene.volume.voxel_size):
+        if is_phantom_cached(phantom, scene.volume.seed, scene.volume.voxel_size):
             return
-    volume = volume_of(scene, late_progress(f"making {scene.volume.name}"))
+    volume = load_volume(scene, late_progress(f"making {scene.volume.name}"))
     if path is not None:
         from us_sim.scene.placement import check_path_in_volume
 
         check_path_in_volume(scene, path, volume, topic)
     if scene.volume.case is not None:
-        from us_sim.scene.case_tissue import keep_tissue
+        from us_sim.scene.case_tissue import cache_tissue
 
-        keep_tissue(scene, volume)
+        cache_tissue(scene, volume)

@@ -13,7 +13,7 @@ _SHARED = ("scipy.sparse", "us_sim.nodes.messages", "us_sim.nodes.settings")
 """No part of a scene: one that a scene does not name is not imported."""
 
 
-def preload() -> None:
+def import_shared() -> None:
     """Import it, as a process that ends with the one that started it."""
     end_with_parent(signal.SIGKILL)
     with contextlib.suppress(ImportError):  # it works without a name in `ps`
@@ -24,11 +24,11 @@ def preload() -> None:
         importlib.import_module(name)
     import numpy as np
 
-    from us_sim.geometry.triangles import vertex_normals
+    from us_sim.geometry.triangles import compute_vertex_normals
 
     # With the first kernel that is loaded numba reads its tables of functions, for 0.7 s.
-    vertex_normals(np.eye(3), np.array([[0, 1, 2]]))
+    compute_vertex_normals(np.eye(3), np.array([[0, 1, 2]]))
     gc.freeze()
 
 
-preload()
+import_shared()

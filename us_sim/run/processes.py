@@ -156,10 +156,10 @@ def end_nodes(nodes: Collection[RunningNode], limit: float = STOP_S) -> list[str
     return [each.node.node for each in killed]
 
 
-def ending(status: int) -> str:
+def describe_ending(status: int) -> str:
     """Return an exit status in words; negative ones are signals.
 
-    >>> ending(-9), ending(3)
+    >>> describe_ending(-9), describe_ending(3)
     ('was ended by SIGKILL', 'ended with status 3')
     """
     if status == INTERRUPTED:

@@ -12,14 +12,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from us_sim.errors import printable
+from us_sim.errors import printable_line
 from us_sim.nodes.settings import AnnotatedImageSettings
 from us_sim.nodes.topics import TOPICS
 from us_sim.recording.reader import Bag
-from us_sim.recording.stamps import stamp_reader
+from us_sim.recording.stamps import make_stamp_reader
 from us_sim.recording.topic import BagTopic
 from us_sim.run.session_tables import SECOND, Progress, read_times
-from us_sim.settings.spelling import aligned, counted
+from us_sim.settings.spelling import align_columns, format_count
 
 POSES = "probe/pose"
 DERIVED = [
@@ -83,9 +83,9 @@ class TopicCheck:
     ) -> None:
         self.topic, self.messages, self._poses = topic, messages, poses
         self._start, self._is_cut = bag.start or 0, bool(bag.fault)
-        self._is_timed = stamp_reader(bag, topic) is not None and not topic.is_latched
+        self._is_timed = make_stamp_reader(bag, topic) is not None and not topic.is_latched
         self.findings: list[Finding] = []
-        self.missing = self._check_numbers(bag.lost()[topic.name], is_numbered)
+        self.missing = self._check_numbers(bag.count_losses()[topic.name], is_numbered)
         self._check_order()
         rate, gap = self._check_gaps()
         ages = self._check_latency()
@@ -105,7 +105,7 @@ class TopicCheck:
         """Add a finding on the messages for which ``rows`` holds, if there are any."""
         if rows.any():
             first = (self.messages["logged"][rows.idxmax()] - self._start) / SECOND
-            count = counted(int(rows.sum()), "message")
+            count = format_count(int(rows.sum()), "message")
             self._tell(kind, f"has {count} that {text}, first at {first:.3f} s: {remedy}")
 
     def _check_numbers(self, said: int, is_numbered: bool) -> int | None:
@@ -123,7 +123,8 @@ class TopicCheck:
             where = f", as the recorder counted {said}" if said else ""
             remedy = "a larger max_cache_size, and its publisher a depth for a second"
             self._tell(
-                "loss", f"lacks {counted(lost, 'message')}{where}: give session_recorder {remedy}"
+                "loss",
+                f"lacks {format_count(lost, 'message')}{where}: give session_recorder {remedy}",
             )
         return missing
 
@@ -171,7 +172,7 @@ class TopicCheck:
         if is_gap.any():
             worst = int(np.argmax(np.where(is_gap, steps, 0.0)))
             longest = f"the longest of {steps[worst]:.3f} s at {begins[worst]:.3f} s"
-            self._tell("gap", f"has {counted(int(is_gap.sum()), 'gap')}, {longest}, {why}")
+            self._tell("gap", f"has {format_count(int(is_gap.sum()), 'gap')}, {longest}, {why}")
         return rate, float(steps.max()) or None
 
     def _times(self, messages: pd.DataFrame) -> NDArray[np.float64]:
@@ -218,7 +219,7 @@ class TopicCheck:
         return int(alone.sum())
 
 
-def check(bag: Bag, progress: Progress = lambda *_: None) -> BagCheck:
+def check_bag(bag: Bag, progress: Progress = lambda *_: None) -> BagCheck:
     """Read all of a bag, of a session or of anything else, and judge it."""
     faults: list[str] = []
     tables = read_times(bag, None, faults, progress)
@@ -238,10 +239,10 @@ def check(bag: Bag, progress: Progress = lambda *_: None) -> BagCheck:
     return BagCheck(bag, topics, [*(Finding("index", text) for text in faults), *findings])
 
 
-def report(found: BagCheck) -> str:
+def format_report(found: BagCheck) -> str:
     """Make the table, and a line for each finding, for a person."""
     size = sum(int(each.messages["size"].sum()) for each in found.topics) / 1e6
     head = f"{found.bag.path}: {found.bag.message_count} messages, {size:.1f} MB"
     told = [f"{each.kind}: {each.text}" for each in found.findings]
-    lines = [head, "", *aligned(found.rows), "", *(told or ["nothing is wrong with it"])]
-    return "\n".join(printable(line) for line in lines)
+    lines = [head, "", *align_columns(found.rows), "", *(told or ["nothing is wrong with it"])]
+    return "\n".join(printable_line(line) for line in lines)

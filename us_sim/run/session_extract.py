@@ -17,18 +17,18 @@ from us_sim.recording.attached_files import new_file
 from us_sim.recording.decoding import affine_from
 from us_sim.recording.reader import Bag
 from us_sim.run.session_lerobot import PIXELS
-from us_sim.run.session_summary import read_session, scene_of
+from us_sim.run.session_summary import read_session, unpack_scene
 from us_sim.run.session_tables import (
     SECOND,
     WRENCH_STAMPED,
     Progress,
-    bodies_of,
+    list_bodies,
+    list_topics,
     read_times,
     read_values,
-    topics_of,
     write_table,
 )
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import format_count
 
 _HELD = {"poses": "poses", "wrench": "wrench", "images": "image", "areas": "scene attached"}
 AREAS = 200  # images of which areas are measured, evenly over the session
@@ -52,9 +52,9 @@ def write_parts(
         UsSimError: the scene for the areas cannot be read.
     """
     needed = {
-        "poses": bodies_of(bag),
-        "wrench": topics_of(bag, WRENCH_STAMPED),
-        "images": topics_of(bag, *PIXELS),
+        "poses": list_bodies(bag),
+        "wrench": list_topics(bag, WRENCH_STAMPED),
+        "images": list_topics(bag, *PIXELS),
         "areas": [name for name in bag.attachments if name == "scene.yaml"],
     }
     if lacking := [part for part in parts if not needed[part]]:
@@ -91,7 +91,7 @@ def _write_images(bag: Bag, name: str, folder: Path, progress: Progress) -> Iter
     millimetres = [f"{1e3 * each:.6g}" for each in spacing] or ["", ""]
     scale: dict[str, Any] = {"dpi": tuple(0.0254 / each for each in spacing)} if spacing else {}
     rows, odd = [], []
-    for number, raw in enumerate(bag.messages([name])):
+    for number, raw in enumerate(bag.read_messages([name])):
         progress(number / len(times), name)
         try:
             pixels = PIXELS[raw.type_name](bag.deserialize(raw), "RGB")
@@ -104,7 +104,7 @@ def _write_images(bag: Bag, name: str, folder: Path, progress: Progress) -> Iter
         rows.append((file.name, _seconds(times[number]), *millimetres))
     progress(1.0, "")
     if odd:
-        yield f"{name}: {counted(len(odd), 'image')} skipped: {odd[0]}"
+        yield f"{name}: {format_count(len(odd), 'image')} skipped: {odd[0]}"
     if rows:
         columns = ["image", "stamp_s", "column_spacing_mm", "row_spacing_mm"]
         yield write_table(stem.with_suffix(".csv"), pd.DataFrame(rows, columns=columns))
@@ -113,10 +113,10 @@ def _write_images(bag: Bag, name: str, folder: Path, progress: Progress) -> Iter
 
 def _write_areas(bag: Bag, folder: Path, progress: Progress) -> Path:
     """Write areas of vessels in the image plane, now and in the same plane of tissue at rest."""
-    with scene_of(bag) as scene:
+    with unpack_scene(bag) as scene:
         session = read_session(bag.path)
         meter = session.measure_lumens(scene, AREAS, lambda done: progress(done, "areas"))
-    areas = meter.areas() if meter is not None else None
+    areas = meter.collect_areas() if meter is not None else None
     if areas is None:
         raise BagError(f"{bag.path}: no image of it cuts a vessel that can be measured")
     first = min(session.poses)
@@ -141,7 +141,7 @@ def _spacing(bag: Bag, name: str) -> list[float]:
     """Find the m from column to column and from row to row, where the recording says so."""
     matrices = f"{name.rpartition('/')[0]}/image_to_probe"
     if any(each.name == matrices for each in bag.topics):
-        for message in bag.messages([matrices]):
+        for message in bag.read_messages([matrices]):
             spacing = np.linalg.norm(affine_from(bag.deserialize(message))[:3, :2], axis=0)
             return spacing.tolist() if spacing.all() else []
     return []

@@ -26,18 +26,18 @@ from us_sim.recording.lerobot_writer import (
     require_lerobot,
     write_episodes,
 )
-from us_sim.recording.path import is_pose, whole_name
+from us_sim.recording.path import are_poses, find_whole_name
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.run.session_tables import (
     SECOND,
     VALUES,
     Progress,
-    bodies_of,
+    list_bodies,
+    list_topics,
     read_times,
     read_values,
-    topics_of,
 )
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import format_count
 from us_sim.tracking.camera.encodings import decode_image, decompress_image
 
 PIXELS: Mapping[str, Callable[[Any, str], NDArray[np.uint8]]] = {
@@ -53,7 +53,7 @@ _MOST_FRAMES = 10_000_000
 _LATE = SECOND  # ns that a stamp may be older than one before; more is another time
 
 
-def to_lerobot(
+def write_lerobot(
     sessions: Sequence[Path],
     folder: Path,
     task: str,
@@ -82,15 +82,15 @@ def to_lerobot(
     def episodes() -> Iterator[LeRobotEpisode]:
         for session in sessions:
             episode = Episode(read_bag(session), **wanted)
-            moments = episode.moments(hertz)
-            frames = episode.frames(moments, progress)
+            moments = episode.choose_moments(hertz)
+            frames = episode.make_frames(moments, progress)
             yield LeRobotEpisode(frames, episode.names, task, str(session))
             counts.append(len(moments))
-            told.extend(f"{session.name}: {sentence}" for sentence in episode.told(moments))
+            told.extend(f"{session.name}: {sentence}" for sentence in episode.describe_use(moments))
 
     write_episodes(folder, hertz, episodes(), is_video=is_video)
     progress(1.0, "")
-    return [*told, f"{counted(sum(counts), 'frame')} at {hertz} Hz in {folder}"]
+    return [*told, f"{format_count(sum(counts), 'frame')} at {hertz} Hz in {folder}"]
 
 
 @dataclass
@@ -106,11 +106,11 @@ class Track:
 
     def __post_init__(self) -> None:
         if len(self.table) < 2:
-            messages = counted(len(self.table), "message")
+            messages = format_count(len(self.table), "message")
             raise BagError(f"has {messages} of use, and two are needed")
         self.times: Times = self.table.index.to_numpy()
 
-    def values(self, moments: Times) -> NDArray[np.float32]:
+    def interpolate(self, moments: Times) -> NDArray[np.float32]:
         """Interpolate (M, N) numbers, each between the nearest that there are.
 
         From one moment to the next a quaternion does not change its sign without need; the first
@@ -129,15 +129,15 @@ class Track:
             made[:, 3:] = found
         return made
 
-    def latest(self, moments: Times) -> NDArray[np.int64]:
+    def find_latest(self, moments: Times) -> NDArray[np.int64]:
         """Find the row (M,) of the last message at or before each moment."""
         return np.searchsorted(self.times, moments, side="right") - 1
 
-    def images(self, bag: Bag, moments: Times) -> Iterator[NDArray[np.uint8]]:
+    def read_images(self, bag: Bag, moments: Times) -> Iterator[NDArray[np.uint8]]:
         """Read the latest image of each moment; for one that is damaged the one before."""
         place, pixels = -1, None
-        messages = enumerate(bag.messages([self.name]))
-        for wanted in self.table["place"].to_numpy()[self.latest(moments)]:
+        messages = enumerate(bag.read_messages([self.name]))
+        for wanted in self.table["place"].to_numpy()[self.find_latest(moments)]:
             if place < wanted:
                 place, raw = next(each for each in messages if each[0] == wanted)
                 try:
@@ -149,16 +149,19 @@ class Track:
             assert pixels is not None
             yield pixels
 
-    def told(self, moments: Times) -> str:
+    def describe_use(self, moments: Times) -> str:
         """Say what became of its messages, in numbers."""
         if self.is_image:
-            shown = self.latest(moments)
+            shown = self.find_latest(moments)
             oldest = (moments - self.times[shown]).max() / SECOND
-            images = f"{len(np.unique(shown))} of {counted(len(self.times), 'image')}"
+            images = f"{len(np.unique(shown))} of {format_count(len(self.times), 'image')}"
             told = f"{images} shown, which are {oldest:.3f} s old at most"
         else:
             between = "slerp" if self.turns else "linear"
-            messages, gap = counted(len(self.times), "message"), np.diff(self.times).max() / SECOND
+            messages, gap = (
+                format_count(len(self.times), "message"),
+                np.diff(self.times).max() / SECOND,
+            )
             told = f"{between} between {messages}, {gap:.3f} s apart at most"
         damaged = [f"{self.damaged} cannot be decoded"] if self.damaged else []
         return "; ".join([f"{self.name}: {told}", *damaged, *self.notes])
@@ -187,11 +190,13 @@ class Episode:
     ) -> None:
         self._bag, self._by_log_time = bag, by_log_time
         self._left_out = [bag.fault] if bag.fault else []
-        self._left_out += [f"the recorder lost {n} of {name}" for name, n in bag.lost().items()]
-        self._actions = [whole_name(bag, action)] if action else []
-        named = [whole_name(bag, name) for name in topics] + self._actions
+        self._left_out += [
+            f"the recorder lost {n} of {name}" for name, n in bag.count_losses().items()
+        ]
+        self._actions = [find_whole_name(bag, action)] if action else []
+        named = [find_whole_name(bag, name) for name in topics] + self._actions
         self._tracks: list[Track] = []
-        all_known = [*topics_of(bag, *PIXELS, *VALUES), *bodies_of(bag), *self._actions]
+        all_known = [*list_topics(bag, *PIXELS, *VALUES), *list_bodies(bag), *self._actions]
         for name in dict.fromkeys(named if topics else all_known):
             try:
                 self._tracks.append(self._read_track(name))
@@ -224,7 +229,7 @@ class Episode:
             for feature, tracks in self._numbers.items()
         }
 
-    def moments(self, rate: int) -> Times:
+    def choose_moments(self, rate: int) -> Times:
         """Choose times of frames, ns: from when all topics have begun until one of them ends.
 
         Raises:
@@ -248,15 +253,17 @@ class Episode:
             )
         return begin + np.arange(count) * SECOND // rate
 
-    def frames(self, moments: Times, progress: Progress = lambda *_: None) -> Iterator[Frame]:
+    def make_frames(self, moments: Times, progress: Progress = lambda *_: None) -> Iterator[Frame]:
         """Make the features of each moment."""
         rows = {
-            feature: np.hstack([each.values(moments) for each in tracks])
+            feature: np.hstack([each.interpolate(moments) for each in tracks])
             for feature, tracks in self._numbers.items()
             if tracks
         }
         images = {  # lerobot allows no slash in a feature's name
-            f"{IMAGES}{each.name.strip('/').replace('/', '_')}": each.images(self._bag, moments)
+            f"{IMAGES}{each.name.strip('/').replace('/', '_')}": each.read_images(
+                self._bag, moments
+            )
             for each in self._images
         }
         for k in range(len(moments)):
@@ -265,19 +272,19 @@ class Episode:
                 name: row[k] for name, row in rows.items()
             }
 
-    def told(self, moments: Times) -> Iterator[str]:
+    def describe_use(self, moments: Times) -> Iterator[str]:
         """Say what became of its messages, after the frames were taken."""
-        yield counted(len(moments), "frame")
+        yield format_count(len(moments), "frame")
         yield from self._left_out
-        yield from (each.told(moments) for each in self._tracks)
+        yield from (each.describe_use(moments) for each in self._tracks)
 
     def _read_track(self, name: str) -> Track:
-        topic = self._bag.topic(name.partition(":")[0])
+        topic = self._bag.find_topic(name.partition(":")[0])
         if topic.type_name not in PIXELS:
             return self._read_numbers(name, turns=topic.type_name not in VALUES)
         if name in self._actions:
             raise BagError("is a topic of images, which are no action")
-        for raw in self._bag.messages([name]):  # refused at once where it cannot be decoded
+        for raw in self._bag.read_messages([name]):  # refused at once where it cannot be decoded
             PIXELS[topic.type_name](self._bag.deserialize(raw), "RGB")
             break
         times, notes = self._judge_times(read_times(self._bag, [name])[name])
@@ -293,7 +300,7 @@ class Episode:
         times, notes = self._judge_times(found)
         there = pd.DataFrame(np.isfinite(table))
         if turns and len(table):
-            there = there.mul(is_pose(table.to_numpy()), axis=0)
+            there = there.mul(are_poses(table.to_numpy()), axis=0)
         table = table.where(there).set_axis(times)
         # Numbers of the same time go together, each as it came first.
         repeated = (table.notna().groupby(level=0).cumsum() > 1) & table.notna()
@@ -321,9 +328,9 @@ class Episode:
             )
         notes = []
         if count := int(has_none.sum()):
-            have = counted(count, "message has", "messages have")
+            have = format_count(count, "message has", "messages have")
             notes.append(f"{have} no stamp, but the time of recording")
         if count := int((late > 0).sum()):
-            are = counted(count, "message is", "messages are")
+            are = format_count(count, "message is", "messages are")
             notes.append(f"{are} stamped before one that was recorded earlier")
         return times, notes

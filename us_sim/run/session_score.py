@@ -12,10 +12,10 @@ from us_sim.nodes.topics import FROZEN
 from us_sim.recording import MARKER
 from us_sim.recording.path import POSE_STAMPED, ProbePath, is_tracker_recording, read_path
 from us_sim.recording.reader import Bag, read_bag
-from us_sim.run.session_summary import POSE, read_session, scene_of
-from us_sim.run.session_tables import SECOND, WRENCH_STAMPED, Progress, read_wrenches, topics_of
-from us_sim.scene.building import probe_of, volume_of
-from us_sim.scoring.lumen import vessels_in
+from us_sim.run.session_summary import POSE, read_session, unpack_scene
+from us_sim.run.session_tables import SECOND, WRENCH_STAMPED, Progress, list_topics, read_wrenches
+from us_sim.scene.building import build_probe, load_volume
+from us_sim.scoring.lumen import find_vessels
 from us_sim.scoring.metrics import Force, Scan
 from us_sim.scoring.motion import Motion
 
@@ -64,7 +64,7 @@ def read_scan(
     except ScoreError as error:
         missing.append(f"force: {error}")
     if f"/{MARKER}" in types:
-        texts = [bag.deserialize(message).data for message in bag.messages([f"/{MARKER}"])]
+        texts = [bag.deserialize(message).data for message in bag.read_messages([f"/{MARKER}"])]
         frozen = sum(text.startswith(FROZEN) for text in texts)
     else:
         missing.append(f"images that were frozen: {file} has no marks on /{MARKER}")
@@ -86,7 +86,7 @@ def _read_force(bag: Bag, topic: str | None, begin: int) -> Force:
         ScoreError: none was named, and there is none, or several, or no wrench that can be used.
     """
     if topic is None:
-        names = topics_of(bag, WRENCH_STAMPED)
+        names = list_topics(bag, WRENCH_STAMPED)
         names = [name for name in names if name.endswith("probe/wrench")] or names
         if len(names) != 1:
             several = f"wrenches on {', '.join(names)}: name one with --wrench"
@@ -108,14 +108,14 @@ def _measure_vessels(bag: Bag, path: ProbePath, progress: Progress) -> dict[str,
     """
     if path.topic != POSE:
         raise BagError(f"they are known for the poses on {POSE} only, not {path.topic}")
-    with scene_of(bag) as scene:
+    with unpack_scene(bag) as scene:
         session = read_session(bag.path)
         samples = max(_SAMPLES, int(_RATE * path.duration))
-        lines, thrombi = vessels_in(volume_of(scene))
+        lines, thrombi = find_vessels(load_volume(scene))
         meter = session.measure_lumens(scene, samples, lambda part: progress(part, "areas"), lines)
     return {
-        "sections": meter.sections() if meter is not None else {},
+        "sections": meter.collect_sections() if meter is not None else {},
         "lines": lines,
         "thrombi": thrombi,
-        "width": probe_of(scene).width,
+        "width": build_probe(scene).width,
     }

@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.sessions.attachments import checksum
-from us_sim.recording.attached_files import extract
+from us_sim.nodes.sessions.attachments import file_checksum
+from us_sim.recording.attached_files import extract_files
 from us_sim.recording.decoding import pixels_from, pose_from, tetrahedra_from, vectors_from
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.run.session_tables import SECOND, read_times
-from us_sim.scene.building import scanner_of, volume_of
+from us_sim.scene.building import build_scanner, load_volume
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 from us_sim.scoring.centre_line import CentreLine
-from us_sim.scoring.lumen import LumenAreas, LumenMeter, lumens_of
+from us_sim.scoring.lumen import LumenAreas, LumenMeter, find_lumen_labels
 from us_sim.slicing.b_mode import BMode
 
 IMAGE, POSE, NODES = "/ultrasound/image", "/probe/pose", "/tissue/nodes"
@@ -45,13 +45,13 @@ class Session:
     times: dict[str, pd.DataFrame]  # of `STAMPED` topics, as of `read_times`
     reports: dict[str, dict[str, str]]  # last diagnostics by node
 
-    def stamps(self, topic: str) -> list[int]:
+    def list_stamps(self, topic: str) -> list[int]:
         """List the stamps of a topic's messages, ns."""
         return self.times[topic]["stamp"].tolist() if topic in self.times else []
 
-    def images_at(self, stamps: Collection[int]) -> dict[int, NDArray[np.uint8]]:
+    def read_images(self, stamps: Collection[int]) -> dict[int, NDArray[np.uint8]]:
         """Read the images with those stamps, (rows, columns) each, in one pass."""
-        messages = zip(self.stamps(IMAGE), self.bag.messages([IMAGE]), strict=True)
+        messages = zip(self.list_stamps(IMAGE), self.bag.read_messages([IMAGE]), strict=True)
         return {
             stamp: pixels_from(self.bag.deserialize(message))
             for stamp, message in messages
@@ -72,10 +72,12 @@ class Session:
         Raises:
             BagError: no image has its pose and nodes.
         """
-        numbers, scanner = self.scanner_of_vessels(scene)
+        numbers, scanner = self.find_vessels(scene)
         if scanner is None:
             return None
-        stamps = [each for each in self.stamps(IMAGE) if each in self.nodes and each in self.poses]
+        stamps = [
+            each for each in self.list_stamps(IMAGE) if each in self.nodes and each in self.poses
+        ]
         if not stamps:
             raise BagError(
                 "the session holds no image with its pose and nodes, so nothing can be measured: "
@@ -86,24 +88,26 @@ class Session:
         picked = np.linspace(0, len(stamps) - 1, min(samples, len(stamps))).astype(int).tolist()
         for k, stamp in enumerate((stamps[at] for at in picked), 1):
             pose = self.poses[stamp]
-            meter.add((stamp - first) / SECOND, pose, scanner.labels(pose, self.nodes[stamp]))
+            meter.add_image(
+                (stamp - first) / SECOND, pose, scanner.render_labels(pose, self.nodes[stamp])
+            )
             progress(k / len(picked))
         return meter
 
-    def scanner_of_vessels(self, scene: Scene) -> tuple[dict[str, tuple[int, ...]], BMode | None]:
-        """Find labels of vessels by their names, see `lumens_of`, and the scanner for them.
+    def find_vessels(self, scene: Scene) -> tuple[dict[str, tuple[int, ...]], BMode | None]:
+        """Find labels of vessels by their names, see `find_lumen_labels`, and the scanner for them.
 
         There is no scanner without labels of vessels, or without tissue.
         """
-        volume = volume_of(scene)
-        numbers = lumens_of(volume.label_names)
+        volume = load_volume(scene)
+        numbers = find_lumen_labels(volume.label_names)
         if volume.labels is None or not numbers or self.rest is None or self.tetrahedra is None:
             return {}, None
-        scanner = scanner_of(scene, volume)
-        scanner.carry(self.rest, self.tetrahedra)
+        scanner = build_scanner(scene, volume)
+        scanner.attach_mesh(self.rest, self.tetrahedra)
         return numbers, scanner
 
-    def summary(self, areas: LumenAreas | None) -> dict[str, Any]:
+    def summarize(self, areas: LumenAreas | None) -> dict[str, Any]:
         """Sum all up as one JSON-like mapping; times in ms, areas in mm².
 
         A latency is the age of the pose when what followed from it was sent, or, ``end_to_end``,
@@ -112,10 +116,10 @@ class Session:
         Raises:
             BagError: the session has no image.
         """
-        stamps = self.stamps(IMAGE)
+        stamps = self.list_stamps(IMAGE)
         if not stamps:
             raise BagError(f"the session holds no image on {IMAGE}")
-        poses = len(self.stamps(PLAYED))
+        poses = len(self.list_stamps(PLAYED))
         seconds = (stamps[-1] - stamps[0]) / SECOND
         latency = {t: _percentiles(self.times[t], "sent") for t in STAMPED[1:] if t in self.times}
         latency["end_to_end"] = _percentiles(self.times[IMAGE], "logged")
@@ -146,7 +150,7 @@ def _summary_of(areas: LumenAreas) -> dict[str, Any]:
         result[f"{name}_at_rest_mm2"] = [None if np.isnan(x) else float(x) for x in at_rest]
         moments = {"at_full_press": areas.pressed, "after_release": len(areas.time) - 1}
         for moment, sample in moments.items():
-            change = float(areas.fraction(name)[sample] - 1.0)
+            change = float(areas.compute_fraction(name)[sample] - 1.0)
             result[f"{name}_change_{moment}"] = None if np.isnan(change) else change
     return result
 
@@ -161,8 +165,8 @@ def read_session(file: Path, *further: Path) -> Session:
     there = {topic.name for topic in bag.topics if topic.message_count}
     times = read_times(bag, sorted(there & {*STAMPED}))
     session = Session(bag, {}, {}, None, None, times, {})
-    stamps = {topic: iter(session.stamps(topic)) for topic in (POSE, NODES)}
-    for message in bag.messages(sorted(there & {POSE, NODES, REST, TETRAHEDRA, REPORTS})):
+    stamps = {topic: iter(session.list_stamps(topic)) for topic in (POSE, NODES)}
+    for message in bag.read_messages(sorted(there & {POSE, NODES, REST, TETRAHEDRA, REPORTS})):
         content = bag.deserialize(message)
         if message.topic == POSE:
             session.poses[next(stamps[POSE])] = pose_from(content)
@@ -180,7 +184,7 @@ def read_session(file: Path, *further: Path) -> Session:
 
 
 @contextlib.contextmanager
-def scene_of(bag: Bag) -> Iterator[Scene]:
+def unpack_scene(bag: Bag) -> Iterator[Scene]:
     """Unpack the scene that is attached to a session, for a while.
 
     Raises:
@@ -194,11 +198,11 @@ def scene_of(bag: Bag) -> Iterator[Scene]:
             f"`us-sim render SCENE --path {bag.path}`"
         )
     with tempfile.TemporaryDirectory(prefix="us_sim_session_") as folder:
-        unpacked = extract(bag.path, Path(folder))
+        unpacked = extract_files(bag.path, Path(folder))
         listed = attached["files.txt"].data.decode() if "files.txt" in attached else ""
-        there = {checksum(file) for file in unpacked}
+        there = {file_checksum(file) for file in unpacked}
         for digest, _, name in (line.partition("  ") for line in listed.splitlines()):
-            if digest not in there and checksum(Path(name)) != digest:
+            if digest not in there and file_checksum(Path(name)) != digest:
                 raise BagError(
                     f"{name} is not the file that {bag.path} was recorded with, and was too large "
                     f"to be attached: bring that one back"

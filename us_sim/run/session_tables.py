@@ -18,9 +18,9 @@ import pandas as pd
 from us_sim.errors import BagError
 from us_sim.recording.attached_files import new_file
 from us_sim.recording.lerobot_writer import POSE_PARTS, WRENCH_PARTS
-from us_sim.recording.path import POSE_STAMPED, bodies_in, pose_rows
+from us_sim.recording.path import POSE_STAMPED, list_bodies, read_pose_rows
 from us_sim.recording.reader import Bag
-from us_sim.recording.stamps import stamp_reader
+from us_sim.recording.stamps import make_stamp_reader
 
 SECOND = 1_000_000_000  # ns
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
@@ -44,11 +44,11 @@ def read_times(
     Raises:
         BagError: the bag is damaged, and ``faults`` is None; or it has no such topic.
     """
-    chosen = bag.topics if topics is None else [bag.topic(name) for name in topics]
-    readers = {topic.name: stamp_reader(bag, topic) for topic in chosen}
+    chosen = bag.topics if topics is None else [bag.find_topic(name) for name in topics]
+    readers = {topic.name: make_stamp_reader(bag, topic) for topic in chosen}
     values = {name: array("q") for name in readers}
     total = max(sum(topic.message_count for topic in chosen), 1)
-    messages = bag.messages(topics) if faults is None else bag.all_messages(faults)
+    messages = bag.read_messages(topics) if faults is None else bag.read_all_messages(faults)
     for done, message in enumerate(messages):
         if done % 500 == 0:
             progress(min(done / total, 0.999), message.topic)
@@ -67,15 +67,15 @@ def read_times(
     }
 
 
-def topics_of(bag: Bag, *types: str) -> list[str]:
+def list_topics(bag: Bag, *types: str) -> list[str]:
     """List the topics of some types that have messages."""
     return [each.name for each in bag.topics if each.message_count and each.type_name in types]
 
 
-def bodies_of(bag: Bag) -> list[str]:
+def list_pose_sources(bag: Bag) -> list[str]:
     """List the topics of PoseStamped with messages, or else every body of other types."""
-    bodies = [name for names in bodies_in(bag).values() for name in names]
-    return topics_of(bag, POSE_STAMPED) or bodies
+    bodies = [name for names in list_bodies(bag).values() for name in names]
+    return list_topics(bag, POSE_STAMPED) or bodies
 
 
 def _numbers(names: tuple[str, ...], linear: Any, angular: Any) -> dict[str, float]:
@@ -104,11 +104,11 @@ def read_values(bag: Bag, name: str) -> tuple[pd.DataFrame, pd.DataFrame]:
     Raises:
         BagError: there is no such topic or body, it has no numbers, or a message is unlike ROS 2's.
     """
-    topic = bag.topic(name.partition(":")[0])
+    topic = bag.find_topic(name.partition(":")[0])
     rows: list[tuple[int, int, str]] = []
     numbers: list[dict[str, float]] = []
     if topic.type_name in VALUES:
-        for raw in bag.messages([topic.name]):
+        for raw in bag.read_messages([topic.name]):
             message = bag.deserialize(raw)
             try:
                 stamp = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
@@ -118,7 +118,7 @@ def read_values(bag: Bag, name: str) -> tuple[pd.DataFrame, pd.DataFrame]:
                 kind = f"no {topic.type_name} of ROS 2"
                 raise BagError(f"{bag.path}, {topic.name}: {kind}: {error}") from None
     else:
-        for row in pose_rows(bag, name):
+        for row in read_pose_rows(bag, name):
             rows.append((row.stamp, row.log_time, row.frame_id))
             numbers.append(dict(zip(POSE_PARTS, row.pose, strict=True)))
     found = pd.DataFrame(rows, columns=["stamp", "logged", "frame"])
@@ -135,7 +135,7 @@ def read_wrenches(bag: Bag, name: str) -> tuple[str, pd.DataFrame]:
         BagError: there is no such topic, it is of another type, is silent, or its wrenches are of
             several frames.
     """
-    topic = bag.topic(name)
+    topic = bag.find_topic(name)
     if topic.type_name != WRENCH_STAMPED:
         raise BagError(f"{bag.path} holds {topic.name} as {topic.type_name}, not {WRENCH_STAMPED}")
     found, table = read_values(bag, topic.name)

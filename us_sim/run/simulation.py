@@ -11,10 +11,10 @@ from typing import Any
 
 from us_sim.errors import BagError, SettingsError, UsSimError
 from us_sim.nodes.settings import PLAYERS, RECORDER, VIEWER, SessionControlSettings
-from us_sim.run.plan import Request, plan_of, require_new
-from us_sim.run.supervision import Supervisor, say
-from us_sim.scene.building import path_of
-from us_sim.scene.listing import ListedScene, listed_scene, listed_scenes
+from us_sim.run.plan import RunRequest, make_plan, require_new
+from us_sim.run.supervision import Supervisor, print_above_bar
+from us_sim.scene.building import load_path
+from us_sim.scene.listing import ListedScene, describe_scene, list_scenes
 from us_sim.scene.reading import check_files, load_scene
 from us_sim.share import find_bag, full_path, shared_roots
 
@@ -33,17 +33,19 @@ class Simulation:
     Where a plan turns out not to work, the one before runs again.
     """
 
-    def __init__(self, request: Request, supervisor: Supervisor) -> None:
+    def __init__(self, request: RunRequest, supervisor: Supervisor) -> None:
         self._request = request
-        self._settled: Request | None = None  # the last with which all nodes were ready
+        self._settled: RunRequest | None = None  # the last with which all nodes were ready
         self._supervisor = supervisor
         self._asked: SessionControlSettings | None = None  # scene that is to be loaded
-        self._unlisted = chain([listed_scene(request.scene.origin)], listed_scenes())
+        self._unlisted = chain([describe_scene(request.scene.origin)], list_scenes())
         self._listed: dict[str, ListedScene] = {}  # by what loads it
         self._bags_at = 0.0
         self._bags: dict[str, str] = {}
         self._problem = ""
-        self._control = supervisor.control(self.check, self.take, self._shown())
+        self._control = supervisor.add_control(
+            self.check_request, self.apply_request, self._shown()
+        )
 
     def update(self) -> None:
         """Update as `Supervisor.update`, and continue pending requests.
@@ -64,7 +66,7 @@ class Simulation:
         self._load_scene()
         self._report()
 
-    def check(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
+    def check_request(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
         """Raise UsSimError where the parameters ask for something impossible."""
         if _OF_SCENE & set(named):
             check_files(load_scene(wanted.scene, volume=wanted.volume))
@@ -79,7 +81,7 @@ class Simulation:
         if {"replay", "replay_as"} & set(named) and wanted.replay:
             file = find_bag(wanted.replay)
             if wanted.replay_as == "path":
-                path_of(self._request.scene, file)
+                load_path(self._request.scene, file)
                 return
             from us_sim.recording.reader import read_bag  # which takes long to import
 
@@ -91,7 +93,7 @@ class Simulation:
                     f"is being recorded to {self._request.record}: end that first"
                 )
 
-    def take(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
+    def apply_request(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
         """Begin to do as the parameters say."""
         self._problem = ""
         if _OF_SCENE & set(named):
@@ -121,7 +123,7 @@ class Simulation:
         elif "replay" in named:
             values["time"] = 0.0
         if values and wanted.replay:
-            self._control.tell_player(self._supervisor.plan.player, values)
+            self._control.set_player_parameters(self._supervisor.plan.player, values)
 
     def _load_scene(self) -> None:
         """Run the scene that was asked for, if any, in place of that which runs."""
@@ -132,17 +134,17 @@ class Simulation:
             scene = load_scene(asked.scene, volume=asked.volume)
             anew = set(self._supervisor.plan.nodes) - {VIEWER}
             self._change(self._request.with_scene(scene), anew)
-            say(f"loading {scene.name}")
+            print_above_bar(f"loading {scene.name}")
         except UsSimError as error:
             self._problem = f"{error}; {self._request.scene.name} goes on"
-            say(self._problem)
-        self._control.show(self._shown())
+            print_above_bar(self._problem)
+        self._control.set_state_parameters(self._shown())
 
-    def _change(self, request: Request, anew: Collection[str] = ()) -> None:
-        plan = plan_of(request)
+    def _change(self, request: RunRequest, anew: Collection[str] = ()) -> None:
+        plan = make_plan(request)
         self._request = request
         if anew or plan.processes != self._supervisor.plan.processes:
-            self._supervisor.change(plan, anew)
+            self._supervisor.change_plan(plan, anew)
 
     def _go_back(self, why: str) -> None:
         """Return to the former scene; a recording and a replay ended for it do not come back."""
@@ -153,10 +155,10 @@ class Simulation:
         if not {*PLAYERS} & {*self._supervisor.plan.nodes}:
             before = before.without_replay()
         self._problem = f"{why}; {before.scene.name} runs as before"
-        say(self._problem)
+        print_above_bar(self._problem)
         self._settled = self._request = before
-        self._supervisor.change(plan_of(before))
-        self._control.show(self._shown())
+        self._supervisor.change_plan(make_plan(before))
+        self._control.set_state_parameters(self._shown())
 
     def _list_scenes(self) -> None:
         """Read one scene more while somebody wants the list; publish it once all are read."""
@@ -166,17 +168,17 @@ class Simulation:
             self._listed.setdefault(scene.origin, scene)
             return
         if self._listed:
-            self._control.tell_scenes([*self._listed.values()])
+            self._control.publish_scenes([*self._listed.values()])
             self._listed.clear()
 
     def _list_bags(self) -> None:
         now, view = time.monotonic(), self._request.view
         if now - self._bags_at < _BAGS_EVERY_S:
             return
-        self._bags_at, bags = now, bags_in_reach(view.recordings if view else None)
+        self._bags_at, bags = now, list_bags(view.recordings if view else None)
         if bags != self._bags:
             self._bags = bags
-            self._control.tell_bags(bags)
+            self._control.publish_bags(bags)
 
     def _report(self) -> None:
         request, waiting = self._request, self._supervisor.waiting
@@ -206,7 +208,7 @@ class Simulation:
             player = reports.get(self._supervisor.plan.player, {})
             values["replay_state"] = player.get("state", "starting")
             values |= {key: player[key] for key in ("position", "duration") if key in player}
-        self._control.tell(state, values, self._problem)
+        self._control.publish_state(state, values, self._problem)
 
     def _shown(self) -> SessionControlSettings:
         """Return the control's parameters as things are."""
@@ -222,7 +224,7 @@ class Simulation:
         )
 
 
-def bags_in_reach(recordings: str | None = None) -> dict[str, str]:
+def list_bags(recordings: str | None = None) -> dict[str, str]:
     """Return bags that can be replayed: files by names, the newest first, installed ones last.
 
     A bag of several files is one with its folder; each of these files is a bag of its own, too.

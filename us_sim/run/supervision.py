@@ -16,16 +16,16 @@ from typing import IO, TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from us_sim.errors import BagError, UsSimError, printable
+from us_sim.errors import BagError, UsSimError, printable_line
 from us_sim.nodes import INTERRUPTED
 from us_sim.nodes.settings import RECORDER, VIEWER
-from us_sim.run.domain import domain, namespace, ros_context
-from us_sim.run.plan import NodeProcess, Plan, goes_on, recorder_of
-from us_sim.run.processes import COMPLAINT, RunningNode, end_nodes, ending
+from us_sim.run.domain import get_domain, get_namespace, make_ros_context
+from us_sim.run.plan import NodeProcess, Plan, can_continue, find_recorder
+from us_sim.run.processes import COMPLAINT, RunningNode, describe_ending, end_nodes
 from us_sim.run.shared_memory import remove_abandoned_segments
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import format_count
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -60,7 +60,7 @@ class SupervisionSettings(Settings):
 
 
 @dataclass
-class Loss:
+class NodeLoss:
     """A node that ended or hung, and its restart."""
 
     node: str
@@ -85,7 +85,7 @@ class Outcome:
     files: Sequence[Path]  # recorded, in their order
     losses: Sequence[str]  # sentences, for a person
 
-    def sentence(self) -> str:
+    def describe_losses(self) -> str:
         """Return the losses in one; nothing when there are none."""
         if not self.losses:
             return ""
@@ -97,7 +97,7 @@ class Outcome:
         return "; ".join(told)
 
 
-def images_in(files: Sequence[Path], name: str) -> int:
+def count_images(files: Sequence[Path], name: str) -> int:
     """Count the images on a topic in recordings; a file that cannot be read has none."""
     from us_sim.recording.reader import read_bag  # takes long to import, and starts need it not
 
@@ -124,7 +124,7 @@ class Supervisor:
 
     def __init__(self, settings: SupervisionSettings, log: Path | None = None) -> None:
         self.plan = Plan([])
-        self.losses: list[Loss] = []
+        self.losses: list[NodeLoss] = []
         self.finished = False  # whether what is played is at its end, or given up
         self._settings, self._log_path = settings, log
         self._log: IO[str] | None = log.open("w", 1, encoding="utf-8") if log else None  # by lines
@@ -133,19 +133,19 @@ class Supervisor:
         self._started: set[tuple[str, int]] = set()  # nodes and processes
         self._strangers: set[tuple[str, int]] = set()  # likewise, that others have started
         self._looked, self._watched = time.monotonic(), 0.0  # s
-        self._away: dict[str, Loss] = {}  # that are being started again
+        self._away: dict[str, NodeLoss] = {}  # that are being started again
         self._were_ready: set[str] = set()
         self._restarts: Counter[str] = Counter()
         self._began = time.monotonic()
         self._startup: float | None = None  # s
         self._changes = 0
 
-    def start(self, plan: Plan) -> None:
+    def start_plan(self, plan: Plan) -> None:
         """Start the nodes of a plan, and hear them; a page loads while ROS is imported here."""
         self._start(each for each in plan.processes if each.node == VIEWER)
         self._listen(plan.nodes)
         self._images = self.monitor.resolve_topic_name(IMAGES)
-        self.change(plan)
+        self.change_plan(plan)
 
     def _listen(self, nodes: Sequence[str]) -> None:
         """Make the monitor, in a context and an executor of its own."""
@@ -153,7 +153,7 @@ class Supervisor:
 
         from us_sim.nodes.session_monitor import SessionMonitor
 
-        context = ros_context()
+        context = make_ros_context()
         self._listening.callback(context.try_shutdown)
         self._executor: Any = SingleThreadedExecutor(context=context)
         self._listening.callback(self._executor.shutdown)
@@ -165,7 +165,9 @@ class Supervisor:
         self._listening.callback(node.destroy_node)
         self._listening.callback(self._executor.remove_node, node)
 
-    def control(self, check: Use, take: Use, settings: SessionControlSettings) -> SessionControl:
+    def add_control(
+        self, check: Use, take: Use, settings: SessionControlSettings
+    ) -> SessionControl:
         """Make the node by which a simulation with these settings is controlled."""
         from us_sim.nodes.session_control import SessionControl
 
@@ -173,13 +175,13 @@ class Supervisor:
         self._add(control)
         return control
 
-    def change(self, plan: Plan, anew: Collection[str] = ()) -> None:
+    def change_plan(self, plan: Plan, anew: Collection[str] = ()) -> None:
         """Run this plan; processes that it shares with the one before go on, but for ``anew``."""
         wanted = {process.node: process for process in plan.processes}
         over = [
             process.node
             for process in self.plan.processes
-            if process.node in anew or not goes_on(process, wanted.get(process.node))
+            if process.node in anew or not can_continue(process, wanted.get(process.node))
         ]
         self._end(over)  # before others of the same names are started
         for node in over:
@@ -189,7 +191,7 @@ class Supervisor:
         self.plan, self.finished = plan, False
         self._restarts.clear()
         self._changes += 1
-        self.monitor.follow(plan.nodes)
+        self.monitor.follow_nodes(plan.nodes)
         self._start(each for each in plan.processes if each.node not in self._running)
 
     def _start(self, processes: Iterable[NodeProcess]) -> None:
@@ -214,7 +216,7 @@ class Supervisor:
                 self._log.write(line)
         is_for_person = self._log is None or node == VIEWER  # which says where its page is
         if is_for_person and not line.startswith(COMPLAINT):  # which is said when it has ended
-            tqdm.write(printable(line.rstrip()), file=sys.stderr)
+            tqdm.write(printable_line(line.rstrip()), file=sys.stderr)
 
     @property
     def waiting(self) -> list[str]:
@@ -241,7 +243,7 @@ class Supervisor:
         self._note_ready()
         self._note_strangers()
 
-    def end(self) -> None:
+    def end_plan(self) -> None:
         """End all nodes; a recorder that had to be killed is lost, as is who is not back.
 
         The monitor goes first: it would wait for what a killed node never acknowledges.
@@ -256,16 +258,20 @@ class Supervisor:
             with contextlib.suppress(OSError):
                 self._log.close()
 
-    def outcome(self) -> Outcome:
+    def make_outcome(self) -> Outcome:
         """Return how it went, once all has ended."""
         node, losses = self.monitor, [str(loss) for loss in self.losses]
         recorded_by = node.recordings.items()
         files = [Path(file) for file, pid in recorded_by if (RECORDER, pid) in self._started]
         # How many images were to be recorded is only known where all that were made were.
-        recorder = recorder_of(self.plan.processes)
-        all_were = recorder and not recorder.paused and recorder.records(self._images, namespace())
+        recorder = find_recorder(self.plan.processes)
+        all_were = (
+            recorder
+            and not recorder.paused
+            and recorder.records_topic(self._images, get_namespace())
+        )
         if files and all_were and self._changes == 1:
-            made, recorded = node.count(IMAGER, IMAGES), images_in(files, self._images)
+            made, recorded = node.count_messages(IMAGER, IMAGES), count_images(files, self._images)
             if recorded < made:
                 losses.insert(0, f"{recorded} images were recorded of {made} that were made")
         if awaited := node.reports.get(self.plan.player, {}).get("awaited", ""):
@@ -279,9 +285,9 @@ class Supervisor:
             self.finished = True
         elif status > 0 and status != INTERRUPTED and node not in self._were_ready:
             see = f"; see {self._log_path}" if self._log_path else ""
-            raise UsSimError(running.complaint or f"{node} {ending(status)}{see}")
+            raise UsSimError(running.complaint or f"{node} {describe_ending(status)}{see}")
         else:
-            self._on_lost(node, ending(status), running.last_words)
+            self._on_lost(node, describe_ending(status), running.last_words)
 
     def _end_silent(self) -> None:
         """End nodes that have not reported for too long, and start them again."""
@@ -311,9 +317,9 @@ class Supervisor:
         """Note a node's end, and start it again with the values that it was first started with."""
         limit, given_up = self._settings.restarts, ""
         if self._restarts[node] >= limit:
-            given_up = f"is not started again after {counted(limit, 'restart')}"
+            given_up = f"is not started again after {format_count(limit, 'restart')}"
         loss = self._note(node, what, said, given_up)
-        self.monitor.tell_lost([str(each) for each in self.losses])
+        self.monitor.report_losses([str(each) for each in self.losses])
         self._restarts[node] += 1
         if given_up:
             self._away.pop(node, None)
@@ -324,7 +330,7 @@ class Supervisor:
         report = self.monitor.reports.get(node, {})
         is_own = report.get("pid") == str(self._running[node].pid)
         first = next(each for each in self.plan.processes if each.node == node)
-        self._start([going_on(first, report if is_own else {})])
+        self._start([continue_process(first, report if is_own else {})])
         self._away[node] = loss
 
     def _note_ready(self) -> None:
@@ -335,32 +341,34 @@ class Supervisor:
         for node in [node for node in self._away if node not in waiting]:
             loss = self._away.pop(node)
             loss.back_after_s = round(time.monotonic() - self._began - loss.at_s, 2)
-            self.monitor.tell_lost([str(each) for each in self.losses])
-            say(f"{node} is back after {loss.back_after_s:.1f} s")
+            self.monitor.report_losses([str(each) for each in self.losses])
+            print_above_bar(f"{node} is back after {loss.back_after_s:.1f} s")
 
     def _note_strangers(self) -> None:
         """Say once of each node of another simulation that it is here, too."""
         for each in self.monitor.heard.keys() - self._started - self._strangers:
             self._strangers.add(each)
-            say(
-                f"another {each[0]} is on ROS domain {domain()}: end that simulation, or set "
+            print_above_bar(
+                f"another {each[0]} is on ROS domain {get_domain()}: end that simulation, or set "
                 f"ROS_DOMAIN_ID to another number for this one"
             )
 
-    def _note(self, node: str, what: str, said: str = "", given_up: str = "") -> Loss:
-        loss = Loss(node, what, round(time.monotonic() - self._began, 2), given_up=given_up)
+    def _note(self, node: str, what: str, said: str = "", given_up: str = "") -> NodeLoss:
+        loss = NodeLoss(node, what, round(time.monotonic() - self._began, 2), given_up=given_up)
         self.losses.append(loss)
         last = f", and last said: {said}" if said else ""
-        say(f"{node} {what} after {loss.at_s:.1f} s{last}; {given_up or 'it is started again'}")
+        print_above_bar(
+            f"{node} {what} after {loss.at_s:.1f} s{last}; {given_up or 'it is started again'}"
+        )
         return loss
 
 
-def say(sentence: str) -> None:
+def print_above_bar(sentence: str) -> None:
     """Print a sentence to the person, above the bar."""
-    tqdm.write(f"us-sim: {printable(sentence)}", file=sys.stderr)
+    tqdm.write(f"us-sim: {printable_line(sentence)}", file=sys.stderr)
 
 
-def going_on(process: NodeProcess, report: Mapping[str, str]) -> NodeProcess:
+def continue_process(process: NodeProcess, report: Mapping[str, str]) -> NodeProcess:
     """Return the process that goes on in place of one that has ended.
 
     A recorder goes on in a further file, and a viewer at the port where pages look for it, as its

@@ -1,11 +1,11 @@
 """The objects a scene names, each made (and its module imported) only when it is asked for.
 
->>> from us_sim.scene.building import colour_of, probe_of, tracking_of
+>>> from us_sim.scene.building import structure_colour, build_probe, build_tracking
 >>> from us_sim.scene.reading import load_scene
 >>> scene = load_scene("upper_arm")
->>> probe_of(scene).columns, tracking_of(scene).filter.lag
+>>> build_probe(scene).columns, build_tracking(scene).filter.lag
 (512, 0.0)
->>> colour_of(scene, "vein")  # blue
+>>> structure_colour(scene, "vein")  # blue
 (0.25, 0.4, 0.85)
 """
 
@@ -27,7 +27,7 @@ from us_sim.scene.scene import Scene, TissueSettings
 from us_sim.settings.registry import COLLIDERS, PROBES, TRACKERS
 from us_sim.slicing.acoustics.settings import AROUND
 from us_sim.tracking.measurement import PATIENT
-from us_sim.volume.structure_names import Colour, anatomical_colour
+from us_sim.volume.structure_names import Colour, choose_colour
 
 if TYPE_CHECKING:
     from us_sim.geometry.collider import Collider
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 _TAKEN_BACK = "; of what the base of a scene says, `null` takes back a material (`fat: null`)"
 
 
-def volume_of(scene: Scene, progress: Callable[[float, str], None] | None = None) -> Volume:
+def load_volume(scene: Scene, progress: Callable[[float, str], None] | None = None) -> Volume:
     """The scene's volume in frame ``patient``.
 
     Raises:
@@ -62,16 +62,16 @@ def volume_of(scene: Scene, progress: Callable[[float, str], None] | None = None
     if scene.volume.case:
         from us_sim.volume.cases.case import read_case
 
-        volume = read_case(scene.volume.case).volume()
+        volume = read_case(scene.volume.case).read_volume()
     elif scene.volume.file:
         from us_sim.volume.files.readers import read_volume
 
         volume = read_volume(Path(scene.volume.file))
     else:
-        from us_sim.volume.phantom.phantom import cached_phantom
+        from us_sim.volume.phantom.phantom import load_or_make_phantom
 
         assert scene.volume.phantom is not None
-        volume = cached_phantom(
+        volume = load_or_make_phantom(
             scene.volume.phantom, scene.volume.seed, scene.volume.voxel_size, progress
         )
     patient_from_volume = scene.volume.pose.pose.matrix
@@ -80,7 +80,7 @@ def volume_of(scene: Scene, progress: Callable[[float, str], None] | None = None
     )
 
 
-def path_of(scene: Scene, file: Path, topic: str | None = None) -> ProbePath:
+def load_path(scene: Scene, file: Path, topic: str | None = None) -> ProbePath:
     """The probe path in a bag or a recording, of the scene's tracker or of the probe itself.
 
     Args:
@@ -115,14 +115,14 @@ def path_of(scene: Scene, file: Path, topic: str | None = None) -> ProbePath:
     return path
 
 
-def probe_of(scene: Scene) -> Probe:
+def build_probe(scene: Scene) -> Probe:
     """The transducer that images.
 
     Raises:
         SceneError: its image is too large.
     """
     section = scene.probe
-    array: Probe = section.array.settings(PROBES)
+    array: Probe = section.array.resolve_settings(PROBES)
     image = section.image or ((512, 512) if section.geometry == "linear" else 512)
     try:
         if isinstance(image, int):
@@ -132,7 +132,7 @@ def probe_of(scene: Scene) -> Probe:
         raise SceneError(f"{scene.origin}: {error}") from error
 
 
-def scanner_of(scene: Scene, volume: Volume, *, threads: int = 1) -> BMode:
+def build_scanner(scene: Scene, volume: Volume, *, threads: int = 1) -> BMode:
     """The scanner that makes the scene's images; its tissue's mesh is for it to be told.
 
     Raises:
@@ -143,7 +143,7 @@ def scanner_of(scene: Scene, volume: Volume, *, threads: int = 1) -> BMode:
     try:
         return BMode(
             volume,
-            probe_of(scene),
+            build_probe(scene),
             scene.imaging,
             scene.imaging.acoustics,
             method=scene.slice.name,
@@ -153,7 +153,7 @@ def scanner_of(scene: Scene, volume: Volume, *, threads: int = 1) -> BMode:
         raise SceneError(f"{scene.origin}: {error}") from error
 
 
-def collider_of(scene: Scene) -> Collider:
+def build_collider(scene: Scene) -> Collider:
     """The probe's shape that presses.
 
     Raises:
@@ -162,11 +162,11 @@ def collider_of(scene: Scene) -> Collider:
     section = scene.probe.collider
     if section is None:
         raise SceneError(f"{scene.origin}: probe.collider: is missing")
-    shape: Collider = section.settings(COLLIDERS)
+    shape: Collider = section.resolve_settings(COLLIDERS)
     return shape
 
 
-def tissue_model_of(
+def build_tissue_model(
     scene: Scene, volume: Volume, note: Callable[[str], None] | None = None
 ) -> TissueModel:
     """Mesh, materials, fixed nodes and collider of the scene's tissue.
@@ -185,8 +185,8 @@ def tissue_model_of(
     if section is None:
         raise SceneError(f"{scene.origin}: tissue: is missing")
     require_labels(scene, volume.label_names)
-    mesh, remarks, fractions = _mesh(scene, section, volume)
-    fixed, held = _fixed_nodes(section, mesh, volume, fractions)
+    mesh, remarks, fractions = _build_mesh(scene, section, volume)
+    fixed, held = _find_fixed_nodes(section, mesh, volume, fractions)
     if note is not None:
         for remark in (*remarks, *held):
             note(f"tissue mesh: {remark}")
@@ -194,15 +194,15 @@ def tissue_model_of(
     contact = np.setdiff1d(touched, np.flatnonzero(fixed)).astype(np.int32)
     return TissueModel(
         mesh=mesh,
-        materials=materials_of(scene, section.materials, mesh, volume, fractions),
+        materials=build_materials(scene, section.materials, mesh, volume, fractions),
         fixed=fixed,
-        collider=collider_of(scene),
+        collider=build_collider(scene),
         contact_nodes=contact,
         gravity=np.array(section.gravity),
     )
 
 
-def materials_of(
+def build_materials(
     scene: Scene,
     materials: Mapping[str, Material],
     mesh: TetrahedralMesh,
@@ -212,22 +212,22 @@ def materials_of(
     """The constants of each tetrahedron, from materials by label name.
 
     Args:
-        fractions: `label_fractions_of` mesh and volume, where they are known already.
+        fractions: `compute_label_fractions` mesh and volume, where they are known already.
 
     Raises:
         SceneError: a label of the volume has no material, or a material no label.
     """
-    from us_sim.tissue.elasticity.materials import average_over_labels, uniform_material
+    from us_sim.tissue.elasticity.materials import average_over_labels, make_uniform_materials
 
-    fractions = fractions or label_fractions_of(mesh, volume)
+    fractions = fractions or compute_label_fractions(mesh, volume)
     require_materials(scene, materials, volume.label_names if fractions else None)
     if fractions is None:
-        return uniform_material(mesh, materials["tissue"])
+        return make_uniform_materials(mesh, materials["tissue"])
     by_label = {label: materials[name] for label, name in volume.label_names.items()}
     return average_over_labels(fractions, by_label)
 
 
-def label_fractions_of(mesh: TetrahedralMesh, volume: Volume) -> LabelFractions | None:
+def compute_label_fractions(mesh: TetrahedralMesh, volume: Volume) -> LabelFractions | None:
     """How much of each tetrahedron each label fills; None without labels."""
     from us_sim.tissue.elasticity.materials import label_fractions
 
@@ -268,7 +268,7 @@ def require_materials(
         )
 
 
-def skin_surface_of(scene: Scene) -> TriangleSurface:
+def load_skin_surface(scene: Scene) -> TriangleSurface:
     """The scene's skin at rest.
 
     Raises:
@@ -289,15 +289,15 @@ def skin_surface_of(scene: Scene) -> TriangleSurface:
     )
 
 
-def membrane_of(scene: Scene, settings: MembraneSettings | None = None) -> SkinMembrane:
+def build_membrane(scene: Scene, settings: MembraneSettings | None = None) -> SkinMembrane:
     """The scene's skin, pressed by the scene's probe; with other settings where they are given."""
     from us_sim.skin.membrane import SkinMembrane
 
-    sheet = skin_surface_of(scene)
-    return SkinMembrane(sheet, collider_of(scene), settings or scene.skin)
+    sheet = load_skin_surface(scene)
+    return SkinMembrane(sheet, build_collider(scene), settings or scene.skin)
 
 
-def _mesh(
+def _build_mesh(
     scene: Scene, section: TissueSettings, volume: Volume
 ) -> tuple[TetrahedralMesh, tuple[str, ...], LabelFractions | None]:
     """The mesh, remarks about it, and how much of each label is in it."""
@@ -309,11 +309,11 @@ def _mesh(
         parts = int(mesh.parts.max()) + 1
         if parts > 1:
             remarks = (*remarks, f"it is in {parts} parts that touch nowhere")
-        return mesh, remarks, label_fractions_of(mesh, volume)
+        return mesh, remarks, compute_label_fractions(mesh, volume)
     if isinstance(given.nodes, int):
-        from us_sim.scene.case_tissue import box_tissue
+        from us_sim.scene.case_tissue import build_box_tissue
 
-        mesh, fractions = box_tissue(scene, volume)
+        mesh, fractions = build_box_tissue(scene, volume)
         return mesh, (), fractions if volume.labels is not None else None
     from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 
@@ -326,17 +326,17 @@ def _mesh(
         for i, axis in enumerate("xyz")
     ]
     mesh = box_mesh(*planes)
-    return mesh, (), label_fractions_of(mesh, volume)
+    return mesh, (), compute_label_fractions(mesh, volume)
 
 
-def _fixed_nodes(
+def _find_fixed_nodes(
     section: TissueSettings,
     mesh: TetrahedralMesh,
     volume: Volume,
     fractions: LabelFractions | None,
 ) -> tuple[NDArray[np.bool_], list[str]]:
     """Nodes on the named faces and inside the named labels (the skeleton is rigid), and remarks."""
-    from us_sim.tissue.model import FACES, face_nodes, held_remark, nodes_in_label
+    from us_sim.tissue.model import FACES, describe_held_nodes, face_nodes, nodes_in_label
 
     numbers = {name: label for label, name in volume.label_names.items()}
     fixed = np.zeros(len(mesh.nodes), dtype=bool)
@@ -349,12 +349,12 @@ def _fixed_nodes(
             assert fractions is not None  # the volume has labels: see `require_labels`
             held = nodes_in_label(mesh, fractions, numbers[name])
         fixed[held] = True
-        remark = held_remark(name, held, mesh)
+        remark = describe_held_nodes(name, held, mesh)
         remarks += [remark] if remark else []
     return fixed, remarks
 
 
-def tracking_of(scene: Scene, filter: PoseFilter | None = None) -> ProbeTracking:
+def build_tracking(scene: Scene, filter: PoseFilter | None = None) -> ProbeTracking:
     """The tracking of the probe by the measurements of the scene's tracker.
 
     Args:
@@ -375,7 +375,7 @@ def tracking_of(scene: Scene, filter: PoseFilter | None = None) -> ProbeTracking
 
         gate = OutlierGate(tracker.gate)
     return ProbeTracking(
-        *tracker_poses_of(scene),
+        *load_tracker_poses(scene),
         filter or create_filter(tracker.filter.name, tracker.filter.given),
         gate,
         time_offset=tracker.time_offset,
@@ -393,10 +393,10 @@ def source_settings(scene: Scene, source: str) -> Any:
     chosen = scene.tracker.source
     if chosen.name == source and chosen.given is not None:
         return chosen.given
-    return TRACKERS.settings(source)()
+    return TRACKERS.load_settings(source)()
 
 
-def tracker_poses_of(scene: Scene) -> tuple[Pose, Pose]:
+def load_tracker_poses(scene: Scene) -> tuple[Pose, Pose]:
     """Registration (the device in ``patient``) and calibration (the probe in the body).
 
     Raises:
@@ -406,7 +406,7 @@ def tracker_poses_of(scene: Scene) -> tuple[Pose, Pose]:
     return _pose_or_file(tracker.registration), _pose_or_file(tracker.calibration)
 
 
-def haptic_rendering_of(scene: Scene) -> HapticRendering:
+def build_haptic_rendering(scene: Scene) -> HapticRendering:
     """The rendering of the wrench on the handle of the scene's haptic arm.
 
     Raises:
@@ -415,7 +415,7 @@ def haptic_rendering_of(scene: Scene) -> HapticRendering:
     from us_sim.tracking.haptic import HapticDevice, HapticRendering
 
     settings = source_settings(scene, "haptic")
-    device = HapticDevice(settings, *tracker_poses_of(scene))
+    device = HapticDevice(settings, *load_tracker_poses(scene))
     return HapticRendering(settings, device, time_offset=scene.tracker.time_offset)
 
 
@@ -427,7 +427,7 @@ def _pose_or_file(given: Placement | str | None) -> Pose:
     return given.pose if given is not None else Pose()
 
 
-def camera_body_of(scene: Scene) -> RigidBody:
+def load_camera_body(scene: Scene) -> RigidBody:
     """The markers on the probe that the scene's camera looks for.
 
     Raises:
@@ -438,7 +438,7 @@ def camera_body_of(scene: Scene) -> RigidBody:
     settings = source_settings(scene, "camera")
     if settings.body:
         return read_rigid_body(settings.body)
-    return RigidBody.single(settings.dictionary, settings.marker, settings.size)
+    return RigidBody.create_single(settings.dictionary, settings.marker, settings.size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -450,10 +450,10 @@ class Structure:
     surface: EmbeddedSurface
 
 
-def colour_of(scene: Scene, name: str) -> Colour:
+def structure_colour(scene: Scene, name: str) -> Colour:
     """Red, green and blue of a structure: the scene's, or a usual one for its label's name."""
     given = scene.structures[name]
-    return given.colour or anatomical_colour(given.label or name)
+    return given.colour or choose_colour(given.label or name)
 
 
 def require_labels(scene: Scene, label_names: Mapping[int, str]) -> None:
@@ -484,7 +484,7 @@ def require_labels(scene: Scene, label_names: Mapping[int, str]) -> None:
             )
 
 
-def structures_of(
+def build_structures(
     scene: Scene, volume: Volume, mesh: TetrahedralMesh, triangles: int
 ) -> Iterator[Structure]:
     """Each structure of the scene, made and embedded one by one.
@@ -511,32 +511,32 @@ def structures_of(
     }
     box = np.stack([mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)])
     if scene.case:  # it has structures where the probe is not
-        from us_sim.volume.surfaces.label_surface import occurs
+        from us_sim.volume.surfaces.label_surface import is_label_within
 
-        labels = {name: one for name, one in labels.items() if occurs(volume, one, box)}
+        labels = {name: one for name, one in labels.items() if is_label_within(volume, one, box)}
     spacing = 0.0
     for name, given in scene.structures.items():
         if not given.file and name not in labels:
             continue
-        colour = colour_of(scene, name)
+        colour = structure_colour(scene, name)
         try:
             if given.file:
                 from us_sim.skin.surface import read_surface
 
                 surface = read_surface(Path(given.file), given.unit)
-                vertices = given.pose.pose.apply(surface.vertices)
+                vertices = given.pose.pose.transform_points(surface.vertices)
                 yield Structure(name, colour, EmbeddedSurface(mesh, vertices, surface.triangles))
                 continue
-            from us_sim.volume.surfaces.label_surface import label_surface, spacing_for
+            from us_sim.volume.surfaces.label_surface import choose_spacing, make_label_surface
 
-            spacing = spacing or spacing_for(volume, list(labels.values()), triangles, box)
-            around = label_surface(volume, labels[name], spacing, box)
-            yield Structure(name, colour, EmbeddedSurface.trimmed(mesh, *around))
+            spacing = spacing or choose_spacing(volume, list(labels.values()), triangles, box)
+            around = make_label_surface(volume, labels[name], spacing, box)
+            yield Structure(name, colour, EmbeddedSurface.embed_trimmed(mesh, *around))
         except UsSimError as error:
             raise SceneError(f"{scene.origin}: structures.{name}: {error}") from error
 
 
-def blood_of(scene: Scene, volume: Volume) -> Blood:
+def build_blood(scene: Scene, volume: Volume) -> Blood:
     """All vessels of a scene that have a flow.
 
     Args:

@@ -4,8 +4,8 @@ Frame ``patient`` is the probe's where it touches the skin at the case's start: 
 middle of the probe's face, and +z goes into the body.
 
 >>> from us_sim.geometry.collider import RoundedBox
->>> from us_sim.scene.case_tissue import footprint
->>> footprint(RoundedBox(length=0.046, width=0.014, height=0.04, rounding=0.004))
+>>> from us_sim.scene.case_tissue import collider_footprint
+>>> collider_footprint(RoundedBox(length=0.046, width=0.014, height=0.04, rounding=0.004))
 (0.023, 0.007)
 """
 
@@ -19,20 +19,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.cache import kept
+from us_sim.cache import load_or_create
 from us_sim.geometry.collider import Capsule, Collider, Sphere
 from us_sim.geometry.pose import Placement, Pose
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.scene.scene import Scene
-from us_sim.settings.reading import document_of
+from us_sim.settings.reading import dump_settings
 from us_sim.settings.registry import COLLIDERS, PROBES
-from us_sim.tissue.elasticity.material import LAYERS, kind_of
+from us_sim.tissue.elasticity.material import LAYERS, guess_tissue_kind
 from us_sim.tissue.elasticity.materials import LabelFractions, label_fractions
-from us_sim.tissue.mesh.box_planes import fitted_planes, spacing_by_labels, spacing_under_probe
+from us_sim.tissue.mesh.box_planes import fit_planes, spacing_by_labels, spacing_under_probe
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.volume.cases.case import LABELS, Case, read_case
 from us_sim.volume.cases.settings import AROUND, SLIDE, CaseSettings
-from us_sim.volume.volume import Volume, grid_extent
+from us_sim.volume.volume import Volume, compute_grid_extent
 
 _BESIDE = 0.013  # m, of tissue beside the probe
 _BELOW = 1.05
@@ -43,7 +43,7 @@ _GENERATOR = 1
 """Part of the cache's key: raise it when a change here, or in what this calls, changes a mesh."""
 
 
-def case_document(folder: Path) -> dict[str, Any]:
+def make_case_document(folder: Path) -> dict[str, Any]:
     """The keys of a scene made from the case in a folder.
 
     Raises:
@@ -52,26 +52,26 @@ def case_document(folder: Path) -> dict[str, Any]:
     case = read_case(folder)
     settings = case.settings
     if settings.start is None or settings.probe is None or settings.probe.collider is None:
-        from us_sim.volume.cases.proposal import with_proposal
+        from us_sim.volume.cases.proposal import complete_settings
 
-        settings = with_proposal(settings, case.volume())
+        settings = complete_settings(settings, case.read_volume())
     assert settings.start is not None
     assert settings.probe is not None
     names = [AROUND, *settings.structures] if case.has_labels else [AROUND]
     held = [name for name in settings.held if case.has_labels or name not in settings.structures]
-    pose = patient_from_volume(settings.start)
+    pose = place_volume(settings.start)
     document: dict[str, Any] = {
         "name": settings.name,
-        "volume": {"case": str(case.folder), "pose": document_of(pose)},
-        "probe": document_of(settings.probe),
+        "volume": {"case": str(case.folder), "pose": dump_settings(pose)},
+        "probe": dump_settings(settings.probe),
         "imaging": {"contact": True},
         "tissue": {
             "solver": "fem_nonlinear",
-            "mesh": _mesh(case, settings.probe, pose),
+            "mesh": _mesh_document(case, settings.probe, pose),
             "fixed": held,
-            "materials": {name: document_of(settings.material_of(name)) for name in names},
+            "materials": {name: dump_settings(settings.material_of(name)) for name in names},
         },
-        "path": _path(settings),
+        "path": _pressing_path(settings),
     }
     if settings.description:
         document["description"] = settings.description
@@ -82,29 +82,33 @@ def case_document(folder: Path) -> dict[str, Any]:
     return document
 
 
-def _path(settings: CaseSettings) -> str:
+def _pressing_path(settings: CaseSettings) -> str:
     assert settings.probe is not None
     press = settings.press
     if press is None:
-        depth = settings.probe.array.settings(PROBES).depth
+        depth = settings.probe.array.resolve_settings(PROBES).depth
         press = min(1 / 3 * depth, 0.022)  # m, of a firm press on an abdomen
-    from us_sim.recording.press_and_slide import pressing_path
+    from us_sim.recording.press_and_slide import find_pressing_path
 
-    return str(pressing_path(press, SLIDE if settings.slide is None else settings.slide))
+    return str(find_pressing_path(press, SLIDE if settings.slide is None else settings.slide))
 
 
-def patient_from_volume(start: Placement) -> Placement:
+def place_volume(start: Placement) -> Placement:
     """The pose of the volume's own frame in that of a probe at ``start``."""
     pose: Pose = start.pose.inverse()
     return Placement(tuple(pose.position.tolist()), tuple(pose.orientation.tolist()))
 
 
-def _mesh(case: Case, probe: ProbeSettings, pose: Placement) -> dict[str, Any]:
+def _mesh_document(case: Case, probe: ProbeSettings, pose: Placement) -> dict[str, Any]:
     """The box of tissue: as wide and deep as the image, as far as the volume goes."""
-    matrix, shape = case.placement()
-    volume = grid_extent(pose.pose.matrix @ matrix, shape)
-    array = probe.array.settings(PROBES)
-    length, width = footprint(probe.collider.settings(COLLIDERS)) if probe.collider else (0.0, 0.0)
+    matrix, shape = case.read_placement()
+    volume = compute_grid_extent(pose.pose.matrix @ matrix, shape)
+    array = probe.array.resolve_settings(PROBES)
+    length, width = (
+        collider_footprint(probe.collider.resolve_settings(COLLIDERS))
+        if probe.collider
+        else (0.0, 0.0)
+    )
     aside = max(array.width / 2, length + _BESIDE)
     # m, along the probe's y: for its slide, and for tissue to give way
     across = max(0.03, 0.25 * array.depth, 2 * width)
@@ -127,7 +131,7 @@ _IN_REACH = 0.015
 """m: how far from the image's plane at rest structures count; the probe slides and tilts."""
 
 
-def footprint(collider: Collider) -> tuple[float, float]:
+def collider_footprint(collider: Collider) -> tuple[float, float]:
     """Half the length and half the width (m, along the probe's x and y) of the collider."""
     if isinstance(collider, Sphere):
         return collider.radius, collider.radius
@@ -136,7 +140,7 @@ def footprint(collider: Collider) -> tuple[float, float]:
     return collider.length / 2, collider.width / 2
 
 
-def box_planes(
+def compute_box_planes(
     scene: Scene, volume: Volume
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Mesh planes (m) along x, y, z of a box that may have so many nodes as the scene says.
@@ -150,25 +154,29 @@ def box_planes(
     assert isinstance(given.nodes, int)
     box = np.array([given.lower, given.upper])
     step = float((box[1] - box[0]).max()) / _STEPS
-    counted = [label for label, name in volume.label_names.items() if counts(scene, name)]
+    counted = [label for label, name in volume.label_names.items() if is_refined(scene, name)]
     labels = volume.labels
     if labels is None:
         labels, counted = np.zeros((1, 1, 1), np.uint8), []
     wanted = spacing_by_labels(
         labels, volume.patient_to_index, box, step, counted=counted, aside=_IN_REACH
     )
-    pressed = footprint(scene.probe.collider.settings(COLLIDERS))
-    return fitted_planes(spacing_under_probe(wanted, *pressed), given.nodes)
+    pressed = collider_footprint(scene.probe.collider.resolve_settings(COLLIDERS))
+    return fit_planes(spacing_under_probe(wanted, *pressed), given.nodes)
 
 
-def counts(scene: Scene, label: str) -> bool:
+def is_refined(scene: Scene, label: str) -> bool:
     """Whether planes are put close together for a label: not for held ones, nor for layers."""
     assert scene.tissue is not None
     named = {given.label or name for name, given in scene.structures.items()}
-    return label in named and label not in scene.tissue.fixed and kind_of(label) not in LAYERS
+    return (
+        label in named
+        and label not in scene.tissue.fixed
+        and guess_tissue_kind(label) not in LAYERS
+    )
 
 
-def keep_tissue(scene: Scene, volume: Volume) -> None:
+def cache_tissue(scene: Scene, volume: Volume) -> None:
     """Make the tissue of the scene's case, unless it is in the user's cache folder already.
 
     Raises:
@@ -176,10 +184,10 @@ def keep_tissue(scene: Scene, volume: Volume) -> None:
     """
     tissue = scene.tissue
     if tissue is not None and not tissue.mesh.file and isinstance(tissue.mesh.nodes, int):
-        box_tissue(scene, volume)
+        build_box_tissue(scene, volume)
 
 
-def box_tissue(scene: Scene, volume: Volume) -> tuple[TetrahedralMesh, LabelFractions]:
+def build_box_tissue(scene: Scene, volume: Volume) -> tuple[TetrahedralMesh, LabelFractions]:
     """Return the box of a scene whose nodes are put where they count, and the labels in it.
 
     That of a case is taken from the user's cache folder, and kept there.
@@ -189,7 +197,7 @@ def box_tissue(scene: Scene, volume: Volume) -> tuple[TetrahedralMesh, LabelFrac
     """
 
     def make() -> tuple[TetrahedralMesh, LabelFractions]:
-        mesh = box_mesh(*box_planes(scene, volume))
+        mesh = box_mesh(*compute_box_planes(scene, volume))
         if volume.labels is None:
             everything = np.ones((len(mesh.tetrahedra), 1))
             return mesh, LabelFractions(np.zeros(1, np.uint8), everything)
@@ -197,7 +205,7 @@ def box_tissue(scene: Scene, volume: Volume) -> tuple[TetrahedralMesh, LabelFrac
 
     if scene.volume.case is None:
         return make()
-    return kept(_key(scene), _pack, _unpack, make)
+    return load_or_create(_cache_key(scene), _pack, _unpack, make)
 
 
 def _pack(
@@ -215,7 +223,7 @@ def _unpack(
     return mesh, LabelFractions(arrays["labels"], arrays["fractions"])
 
 
-def _key(scene: Scene) -> str:
+def _cache_key(scene: Scene) -> str:
     """Return a file name of all that the tissue follows from."""
     assert scene.tissue is not None
     assert scene.probe.collider is not None
@@ -230,8 +238,8 @@ def _key(scene: Scene) -> str:
         "lower": list(mesh.lower or ()),
         "upper": list(mesh.upper or ()),
         "nodes": mesh.nodes,
-        "probe": list(footprint(scene.probe.collider.settings(COLLIDERS))),
-        "structures": sorted(label for label in named if counts(scene, label)),
+        "probe": list(collider_footprint(scene.probe.collider.resolve_settings(COLLIDERS))),
+        "structures": sorted(label for label in named if is_refined(scene, label)),
         "position": list(pose.position),
         "orientation": list(pose.orientation),
         "labels": checksum,

@@ -23,7 +23,7 @@ _TURN = Quantity("angle", -1.5, 1.5)
 
 
 @dataclass(frozen=True)
-class Draws(Settings):
+class DrawRanges(Settings):
     """Ranges, lowest and highest, from which each episode draws; equal ends fix a value."""
 
     section = "episode.draws"
@@ -72,7 +72,7 @@ class Draws(Settings):
         for name in rules_of(type(self)):
             low, high = getattr(self, name)
             if low > high:
-                raise self.refused(name, f"goes down, from {low:g} to {high:g}: swap the two")
+                raise self.make_error(name, f"goes down, from {low:g} to {high:g}: swap the two")
 
 
 @dataclass(frozen=True)
@@ -121,4 +121,6 @@ class EpisodeSettings(Settings):
         description="label of the vessel that tasks are about; not given: the first vein",
         default=None,
     )
-    draws: Draws = setting(description="ranges of what differs between episodes", default=Draws())
+    draws: DrawRanges = setting(
+        description="ranges of what differs between episodes", default=DrawRanges()
+    )

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from us_sim.errors import UsSimError
-from us_sim.scene.reading import find_scene, installed_scenes, load_scene
+from us_sim.scene.reading import find_installed_scenes, find_scene, load_scene
 from us_sim.scene.scene import CASE_PREFIX, EXERCISE_PREFIX
 
 
@@ -28,32 +28,32 @@ class ListedScene:
     problem: str = ""  # why it cannot be loaded as it is
 
 
-def listed_scenes() -> Iterator[ListedScene]:
-    """List exercises that name a scene, installed scenes, cases of `case_roots`; each name once."""
-    from us_sim.scoring.exercise import installed_exercises
-    from us_sim.volume.cases.case import case_roots, cases_in
+def list_scenes() -> Iterator[ListedScene]:
+    """List exercises that name a scene, installed scenes, cases of `list_case_roots`; each name once."""
+    from us_sim.scoring.exercise import read_installed_exercises
+    from us_sim.volume.cases.case import find_cases, list_case_roots
 
-    for exercise in installed_exercises():
+    for exercise in read_installed_exercises():
         if exercise.scene is not None:
             origin, about = f"{EXERCISE_PREFIX}{exercise.origin}", exercise.description
             yield ListedScene(
                 exercise.name, origin, "exercise", f"{about} {exercise.minutes} min", exercise.scene
             )
-    for file in installed_scenes().values():
-        yield listed_scene(str(file))
+    for file in find_installed_scenes().values():
+        yield describe_scene(str(file))
     folders: dict[str, Path] = {}
-    for root in case_roots():
+    for root in list_case_roots():
         if os.path.isdir(root):
-            for folder in cases_in(root):
+            for folder in find_cases(root):
                 folders.setdefault(folder.name, folder)
     for folder in folders.values():
-        yield listed_scene(f"{CASE_PREFIX}{folder.resolve()}")
+        yield describe_scene(f"{CASE_PREFIX}{folder.resolve()}")
 
 
-def listed_scene(name: str) -> ListedScene:
+def describe_scene(name: str) -> ListedScene:
     """The entry of a scene, or of ``case:`` and a case."""
     if name.startswith(CASE_PREFIX):
-        return _listed_case(Path(name.removeprefix(CASE_PREFIX)))
+        return _describe_case(Path(name.removeprefix(CASE_PREFIX)))
     try:
         scene = load_scene(name)
     except UsSimError as error:
@@ -71,10 +71,10 @@ def listed_scene(name: str) -> ListedScene:
     )
 
 
-def _listed_case(folder: Path) -> ListedScene:
-    from us_sim.volume.cases.case import listed, read_case
+def _describe_case(folder: Path) -> ListedScene:
+    from us_sim.volume.cases.case import list_case, read_case
 
-    origin, case = f"{CASE_PREFIX}{folder}", listed(folder)
+    origin, case = f"{CASE_PREFIX}{folder}", list_case(folder)
     if case.problem:
         return ListedScene(case.name, origin, "case", problem=case.problem)
     settings = read_case(folder).settings

@@ -12,22 +12,28 @@ from numpy.typing import NDArray
 from us_sim.errors import SceneError
 from us_sim.geometry.pose import Pose
 from us_sim.recording.path import ProbePath
-from us_sim.scene.building import path_of, probe_of, tissue_model_of, tracker_poses_of, volume_of
+from us_sim.scene.building import (
+    build_probe,
+    build_tissue_model,
+    load_path,
+    load_tracker_poses,
+    load_volume,
+)
 from us_sim.scene.scene import Scene
 from us_sim.slicing.probe.probe import Probe
-from us_sim.tissue.mesh.embedding import locate
+from us_sim.tissue.mesh.embedding import locate_points
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, signed_volumes
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 from us_sim.tracking.measurement import PATIENT
 from us_sim.volume.reconstruction.settings import ImagePart
-from us_sim.volume.sequences.sweep import Sweep
+from us_sim.volume.sequences.sweep import TrackedSweep
 from us_sim.volume.volume import Volume
 
 _MOST_FRAMES = 60
 """Frames of a solver until the tissue under one pose is at rest; inertia and creep take some."""
 
 
-def rest_placement(scene: Scene, sweep: Sweep, part: ImagePart) -> RestPlacement:
+def build_rest_placement(scene: Scene, sweep: TrackedSweep, part: ImagePart) -> RestPlacement:
     """The placement at rest of a sweep's frames.
 
     Args:
@@ -44,14 +50,14 @@ def rest_placement(scene: Scene, sweep: Sweep, part: ImagePart) -> RestPlacement
             f"{scene.origin}: has no tissue, so that no pressure can be undone; name a scene with "
             f"`tissue`"
         )
-    model = tissue_model_of(scene, volume_of(scene))
+    model = build_tissue_model(scene, load_volume(scene))
     name = scene.tissue.solver
     solver = create_solver(name, model, scene.solver_settings(name))
-    poses = [probe_pose(matrix, part, sweep.columns) for matrix in sweep.image_to_reference]
+    poses = [find_probe_pose(matrix, part, sweep.columns) for matrix in sweep.image_to_reference]
     return RestPlacement(solver, poses)
 
 
-def probe_pose(image_to_reference: NDArray[np.float64], part: ImagePart, columns: int) -> Pose:
+def find_probe_pose(image_to_reference: NDArray[np.float64], part: ImagePart, columns: int) -> Pose:
     """Of the probe whose image this is: its face is at the top middle of the image's part."""
     top = np.array([0.5 * (columns - 1), -0.5, 0.0, 1.0])  # the upper edge of the first row
     if part.fan_origin is not None and part.fan_radius is not None:
@@ -84,20 +90,20 @@ class RestPlacement:
     def __call__(self, frame: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 3) m at rest, of points (N, 3) m seen in a frame; nan outside the tissue."""
         if frame != self._frame:
-            self._frame, self._nodes = frame, self._deformed(self.poses[frame])
+            self._frame, self._nodes = frame, self._deform(self.poses[frame])
         mesh = self.solver.model.mesh
         # A linear method may turn tetrahedra inside out under a probe's edge: none is seen there.
         upright = np.flatnonzero(signed_volumes(self._nodes, mesh.tetrahedra) > 0.0)
         kept, tetrahedra = np.unique(mesh.tetrahedra[upright], return_inverse=True)
         corners_of = tetrahedra.reshape(-1, 4).astype(np.int32)
         deformed = TetrahedralMesh(self._nodes[kept], corners_of)
-        where = locate(deformed, points)
+        where = locate_points(deformed, points)
         corners = mesh.nodes[mesh.tetrahedra[upright[where.tetrahedra]]]
         rest = np.einsum("pa,pax->px", where.weights, corners)
         rest[where.outside > 0.0] = np.nan
         return np.asarray(rest, dtype=np.float64)
 
-    def _deformed(self, pose: Pose) -> NDArray[np.float64]:
+    def _deform(self, pose: Pose) -> NDArray[np.float64]:
         """The nodes (N, 3) m under a held probe."""
         for _ in range(_MOST_FRAMES):
             deformation = self.solver.deform(pose)
@@ -113,7 +119,7 @@ _LITTLE = 0.002
 """Part of the best image of a path that is of the volume, below which the path is refused."""
 
 
-def part_inside(
+def compute_part_inside(
     probe: Probe,
     poses: Sequence[Pose],
     patient_to_index: NDArray[np.float64],
@@ -155,15 +161,15 @@ def check_path_in_volume(
         SceneError: with where the volume is, and where the images are.
         BagError: the path cannot be read.
     """
-    poses, probe = _sampled(scene, path_of(scene, file, topic)), probe_of(scene)
+    poses, probe = _sample_poses(scene, load_path(scene, file, topic)), build_probe(scene)
     scanned = volume.intensities if volume.intensities.any() else None  # black at any pose
-    shown = part_inside(probe, poses, volume.patient_to_index, volume.shape, scanned)
+    shown = compute_part_inside(probe, poses, volume.patient_to_index, volume.shape, scanned)
     if shown.max() >= _LITTLE:
         return
     reaches = " × ".join(f"{1e3 * a:.0f} to {1e3 * b:.0f}" for a, b in volume.extent.T)
     pixel = [(probe.columns - 1) / 2, (probe.rows - 1) / 2, 0.0, 1.0]  # in the image's middle
     place = (probe.image_to_probe @ pixel)[None, :3]
-    middle = 1e3 * np.mean([pose.apply(place)[0] for pose in poses], axis=0)
+    middle = 1e3 * np.mean([pose.transform_points(place)[0] for pose in poses], axis=0)
     raise SceneError(
         f"{scene.origin}: volume.pose: the volume, {scene.volume.name}, is seen in no image along "
         f"{file.name}: in `patient` it reaches from {reaches} mm, and the middle of the images is "
@@ -172,8 +178,8 @@ def check_path_in_volume(
     )
 
 
-def _sampled(scene: Scene, path: ProbePath) -> list[Pose]:
-    registration, calibration = tracker_poses_of(scene)
+def _sample_poses(scene: Scene, path: ProbePath) -> list[Pose]:
+    registration, calibration = load_tracker_poses(scene)
     if path.frame_id == PATIENT:  # the probe's own, or of a tracker whose frame that is
         of_tracker = scene.tracker.frame == PATIENT
         registration, calibration = (registration, calibration) if of_tracker else (Pose(), Pose())

@@ -1,7 +1,7 @@
 """Reading a scene file: YAML, merged with the scene it is based on, every key and value checked.
 
->>> from us_sim.scene.reading import check_files, merged, parse_scene
->>> merged({"probe": {"depth": "4 cm", "lines": 128}, "skin": {}},
+>>> from us_sim.scene.reading import check_files, merge_documents, parse_scene
+>>> merge_documents({"probe": {"depth": "4 cm", "lines": 128}, "skin": {}},
 ...        {"probe": {"depth": "6 cm"}, "skin": None})
 {'probe': {'depth': '6 cm', 'lines': 128}}
 >>> scene = parse_scene({"name": "bare", "volume": {"phantom": "upper_arm"},
@@ -24,19 +24,19 @@ from typing import Any, Union, get_args, get_origin
 
 from us_sim.errors import CaseError, ProbeError, SceneError, UsSimError
 from us_sim.scene.building import (
-    camera_body_of,
-    path_of,
-    probe_of,
+    build_probe,
+    build_tracking,
+    load_camera_body,
+    load_path,
     require_labels,
     require_materials,
     source_settings,
-    tracking_of,
 )
 from us_sim.scene.scene import CASE_PREFIX, EXERCISE_PREFIX, Scene, TissueSettings
 from us_sim.settings.choice import Choice
-from us_sim.settings.reading import Reader
+from us_sim.settings.reading import SettingsReader
 from us_sim.settings.setting import Settings, kinds_of, rules_of
-from us_sim.settings.spelling import nearest
+from us_sim.settings.spelling import find_closest
 from us_sim.settings.text_files import read_yaml
 from us_sim.share import full_path, shared_roots
 from us_sim.volume.settings import VOXEL_SIZE
@@ -75,20 +75,20 @@ def read_document(
     below, more = read_document(base, find, (*seen, path))
     if not isinstance(below, dict):
         raise SceneError(f"{path}: {BASE}: {base} is no mapping of keys")
-    return merged(below, document), [*folders, *more]
+    return merge_documents(below, document), [*folders, *more]
 
 
-def merged(below: dict[Any, Any], above: dict[Any, Any]) -> dict[Any, Any]:
+def merge_documents(below: dict[Any, Any], above: dict[Any, Any]) -> dict[Any, Any]:
     """``below`` overridden by ``above``: mappings key by key, anything else replaced.
 
     Where ``above`` chooses another kind of probe, collider, filter, ..., what only some kinds have
     goes with the one below; where it names a file in place of a box, the box goes. ``null`` takes
     back what ``below`` says.
     """
-    return _merged(below, above, Scene)
+    return _merge(below, above, Scene)
 
 
-def _merged(
+def _merge(
     below: dict[Any, Any],
     above: dict[Any, Any],
     settings: type[Settings] | None,
@@ -100,14 +100,16 @@ def _merged(
     Args:
         each: the type of what is under any key, where keys are names that a person chose.
     """
-    gone = _no_longer(below, above, choice) if choice else set()
+    gone = _dropped_keys(below, above, choice) if choice else set()
     rules = rules_of(settings) if settings else {}
-    gone |= _replaced(above, settings.alternatives) if settings else set()
+    gone |= _replaced_keys(above, settings.alternatives) if settings else set()
     gone |= {key for key, value in above.items() if value is None}
     for rule in rules.values():
         if rule.choice and rule.place == "beside":
-            gone |= _no_longer(below, above, rule.choice)
-        elif rule.choice and rule.place == "named" and _changes(below, above, rule.choice):
+            gone |= _dropped_keys(below, above, rule.choice)
+        elif (
+            rule.choice and rule.place == "named" and _is_choice_changed(below, above, rule.choice)
+        ):
             gone |= set(rule.choice.names)
         elif rule.applies and above.get(rule.applies[0]) not in (None, *rule.applies[1]):
             gone |= {name for name, other in rules.items() if other is rule}
@@ -118,13 +120,13 @@ def _merged(
             kind = kinds_of(settings).get(key) if settings else each
             rule_of_key = rules.get(key)
             chosen = rule_of_key.choice if rule_of_key and rule_of_key.place == "within" else None
-            value = _merged(under, value, _settings_in(kind), chosen, _kind_of_each(kind))
+            value = _merge(under, value, _settings_in(kind), chosen, _kind_of_each(kind))
         if value is not None or key not in below:
             result[key] = value
     return result
 
 
-def _replaced(above: dict[Any, Any], alternatives: Mapping[str, tuple[str, ...]]) -> set[str]:
+def _replaced_keys(above: dict[Any, Any], alternatives: Mapping[str, tuple[str, ...]]) -> set[str]:
     """The keys in whose place ``above`` names something, if it names one thing."""
     named = [name for name in alternatives if above.get(name) is not None]
     if len(named) != 1:
@@ -133,15 +135,15 @@ def _replaced(above: dict[Any, Any], alternatives: Mapping[str, tuple[str, ...]]
     return others - {named[0], *alternatives[named[0]]}
 
 
-def _changes(below: dict[Any, Any], above: dict[Any, Any], choice: Choice) -> bool:
+def _is_choice_changed(below: dict[Any, Any], above: dict[Any, Any], choice: Choice) -> bool:
     return choice.key in above and above[choice.key] != below.get(choice.key)
 
 
-def _no_longer(below: dict[Any, Any], above: dict[Any, Any], choice: Choice) -> set[str]:
+def _dropped_keys(below: dict[Any, Any], above: dict[Any, Any], choice: Choice) -> set[str]:
     """The keys that not all options have, if another option is chosen."""
-    if not _changes(below, above, choice):
+    if not _is_choice_changed(below, above, choice):
         return set()
-    keys = [set(rules_of(choice.settings(name))) for name in choice.names]
+    keys = [set(rules_of(choice.load_settings(name))) for name in choice.names]
     return set().union(*keys) - keys[0].intersection(*keys)
 
 
@@ -173,11 +175,11 @@ def check_files(scene: Scene) -> list[str]:
         from us_sim.volume.cases.case import read_case
 
         case = read_case(scene.volume.case)
-        case.placement()
+        case.read_placement()
         if case.has_labels:
             case.check_grids()
         checked.append("volume.case (its headers)")
-    check_names(scene)
+    check_structure_names(scene)
     if scene.tissue is not None and scene.tissue.mesh.file:
         checked.append(f"tissue.mesh.file ({'; '.join(_mesh_remarks(scene.tissue))})")
     surfaces = {f"structures.{name}.file": s.file for name, s in scene.structures.items()}
@@ -190,17 +192,17 @@ def check_files(scene: Scene) -> list[str]:
             read_surface(file)
             checked.append(key)
     tracker = scene.tracker
-    tracking_of(scene)
+    build_tracking(scene)
     checked += [
         f"tracker.{key}"
         for key in ("registration", "calibration")
         if isinstance(getattr(tracker, key), str)
     ]
     if tracker.source.name == "camera" and source_settings(scene, "camera").body:
-        camera_body_of(scene)
+        load_camera_body(scene)
         checked.append("tracker.camera.body")
     if tracker.source.name == "path" and tracker.file:
-        path_of(scene, Path(tracker.file))
+        load_path(scene, Path(tracker.file))
         checked.append("tracker.file")
     checked += ["exercise"] if scene.exercise else []
     if scene.path:
@@ -211,7 +213,7 @@ def check_files(scene: Scene) -> list[str]:
     return checked
 
 
-def check_names(scene: Scene) -> None:
+def check_structure_names(scene: Scene) -> None:
     """Check that the volume has what the scene and its exercise name, without reading it.
 
     Raises:
@@ -223,9 +225,9 @@ def check_names(scene: Scene) -> None:
         require_materials(scene, scene.tissue.materials, names)
     if scene.exercise:
         from us_sim.scoring.exercise import read_exercise
-        from us_sim.scoring.lumen import lumens_of
+        from us_sim.scoring.lumen import find_lumen_labels
 
-        vessels = lumens_of(names or {})
+        vessels = find_lumen_labels(names or {})
         for name in read_exercise(scene.exercise).assigned.structures:
             if name not in vessels:
                 raise SceneError(
@@ -242,9 +244,9 @@ def _label_names(scene: Scene) -> Mapping[int, str] | None:
         case = read_case(scene.volume.case)
         return case.settings.label_names if case.has_labels else None
     if scene.volume.phantom:
-        from us_sim.volume.phantom.phantom import cached_phantom
+        from us_sim.volume.phantom.phantom import load_or_make_phantom
 
-        coarsest = cached_phantom(scene.volume.phantom, scene.volume.seed, VOXEL_SIZE.maximum)
+        coarsest = load_or_make_phantom(scene.volume.phantom, scene.volume.seed, VOXEL_SIZE.maximum)
         return coarsest.label_names
     return None
 
@@ -252,16 +254,16 @@ def _label_names(scene: Scene) -> Mapping[int, str] | None:
 def _mesh_remarks(tissue: TissueSettings) -> list[str]:
     """Remarks about the mesh of a file that can be told without the volume."""
     from us_sim.tissue.mesh.file import read_mesh
-    from us_sim.tissue.model import FACES, face_nodes, held_remark
+    from us_sim.tissue.model import FACES, describe_held_nodes, face_nodes
 
     given = tissue.mesh
     mesh, remarks = read_mesh(Path(given.file or ""), given.unit, given.pose.pose)
     names = [name for name in tissue.fixed if name in FACES]
-    held = [held_remark(name, face_nodes(mesh, name, given.margin), mesh) for name in names]
+    held = [describe_held_nodes(name, face_nodes(mesh, name, given.margin), mesh) for name in names]
     return [f"{len(mesh.nodes)} nodes", *remarks, *(said for said in held if said)]
 
 
-def installed_scenes() -> dict[str, Path]:
+def find_installed_scenes() -> dict[str, Path]:
     """The files in ``config/scenes``, by name."""
     known: dict[str, Path] = {}
     for root in shared_roots():
@@ -279,13 +281,15 @@ def find_scene(name: str | Path) -> Path:
     path = Path(os.path.expanduser(name))
     if os.path.isfile(path):
         return path.resolve()
-    known = installed_scenes()
+    known = find_installed_scenes()
     stem = path.name.removesuffix(".yaml")
     if str(path) in (stem, f"{stem}.yaml") and stem in known:
         return known[stem]
-    from us_sim.scoring.exercise import installed_files
+    from us_sim.scoring.exercise import find_exercise_files
 
-    like = f"{EXERCISE_PREFIX}{stem}" if stem in installed_files() else nearest(stem, known)
+    like = (
+        f"{EXERCISE_PREFIX}{stem}" if stem in find_exercise_files() else find_closest(stem, known)
+    )
     hint = f"; did you mean {like}?" if like else ""
     raise SceneError(
         f"there is no scene file {name}; installed scenes are {', '.join(known)}{hint}"
@@ -303,13 +307,13 @@ def load_scene(name: str | Path, *, volume: str | Path | None = None) -> Scene:
     Raises:
         SceneError: the file or a value in it cannot be used; one sentence with file and key.
     """
-    document, folders, origin = scene_document(name)
+    document, folders, origin = read_scene_document(name)
     if volume and isinstance(document, dict):
         document = with_volume(document, str(full_path(volume)))
     return parse_scene(document, origin=origin, folders=folders)
 
 
-def scene_document(name: str | Path) -> tuple[Any, list[Path], str]:
+def read_scene_document(name: str | Path) -> tuple[Any, list[Path], str]:
     """Return the document of a scene, case or exercise, the folders of its files, its origin.
 
     Raises:
@@ -323,13 +327,13 @@ def scene_document(name: str | Path) -> tuple[Any, list[Path], str]:
             raise SceneError(str(error)) from error
         return {"case": str(folder)}, [folder.parent], f"{CASE_PREFIX}{folder}"
     if str(name).startswith(EXERCISE_PREFIX):
-        return _exercise_document(str(name).removeprefix(EXERCISE_PREFIX))
+        return _read_exercise_document(str(name).removeprefix(EXERCISE_PREFIX))
     path = find_scene(name)
     document, folders = read_document(path, find_scene)
     return document, folders, str(path)
 
 
-def _exercise_document(name: str) -> tuple[Any, list[Path], str]:
+def _read_exercise_document(name: str) -> tuple[Any, list[Path], str]:
     """Return the document of an exercise's scene, its folders, and an origin with the seed drawn.
 
     Args:
@@ -354,19 +358,19 @@ def _exercise_document(name: str) -> tuple[Any, list[Path], str]:
         seed = int(given) if given else random.randint(*exercise.seeds)
         more["volume"] = {"seed": seed}
         origin += f"#{seed}"
-    return merged(document, more), folders, origin
+    return merge_documents(document, more), folders, origin
 
 
 def with_volume(document: dict[Any, Any], file: str) -> dict[Any, Any]:
     """The document with another volume in place of its own."""
-    return merged(document, {"volume": {"file": file}})
+    return merge_documents(document, {"volume": {"file": file}})
 
 
 def with_path(document: dict[Any, Any], file: str) -> dict[Any, Any]:
     """The document with another probe path in place of its own, and of its tracker's recording."""
     tracker = document.get("tracker") or {}
     plays = {"tracker": {"file": file}} if tracker.get("source") == "path" else {}
-    return merged(document, {"path": file, **plays})
+    return merge_documents(document, {"path": file, **plays})
 
 
 def parse_scene(document: object, *, origin: str = "scene", folders: Sequence[Path] = ()) -> Scene:
@@ -379,16 +383,20 @@ def parse_scene(document: object, *, origin: str = "scene", folders: Sequence[Pa
         raise SceneError(f"{origin}: is empty; a scene has at least name, volume and probe")
 
     def find_file(name: str, key: str) -> str:
-        return _existing(name, origin, [*folders, Path.cwd()], key)
+        return _find_existing(name, origin, [*folders, Path.cwd()], key)
 
     document = _with_case(document, origin, [*folders, Path.cwd()])
     document = _with_named_structures(document)
-    Reader(origin, None, SceneError).read(Scene, document)  # files matter once all else is right
-    scene = replace(Reader(origin, find_file, SceneError).read(Scene, document), origin=origin)
-    probe = probe_of(scene)
+    SettingsReader(origin, None, SceneError).read(
+        Scene, document
+    )  # files matter once all else is right
+    scene = replace(
+        SettingsReader(origin, find_file, SceneError).read(Scene, document), origin=origin
+    )
+    probe = build_probe(scene)
     if scene.imaging.acoustics.is_live:
         try:
-            scene.imaging.acoustics.frequency_among(probe.frequencies)
+            scene.imaging.acoustics.choose_frequency(probe.frequencies)
         except ProbeError as error:
             raise SceneError(f"{origin}: {error}") from error
     return scene
@@ -399,10 +407,10 @@ def _with_case(document: object, origin: str, folders: Sequence[Path]) -> object
     case = document.get("case") if isinstance(document, dict) else None
     if not isinstance(document, dict) or not isinstance(case, str) or not case.strip():
         return document
-    from us_sim.scene.case_tissue import case_document
+    from us_sim.scene.case_tissue import make_case_document
 
     try:
-        return merged(case_document(_find_case(case, folders)), document)
+        return merge_documents(make_case_document(_find_case(case, folders)), document)
     except UsSimError as error:
         raise SceneError(f"{origin}: case: {error}") from error
 
@@ -426,7 +434,7 @@ def _find_case(name: str, folders: Sequence[Path] = ()) -> Path:
     return find_case(name, folders)
 
 
-def _existing(name: str, origin: str, folders: Sequence[Path], key: str) -> str:
+def _find_existing(name: str, origin: str, folders: Sequence[Path], key: str) -> str:
     if key in ("case", "volume.case"):
         try:
             return str(_find_case(name, folders))

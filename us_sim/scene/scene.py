@@ -14,7 +14,7 @@ from us_sim.errors import SceneError
 from us_sim.geometry.pose import Placement
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.scene.episode import EpisodeSettings
-from us_sim.settings.choice import Chosen
+from us_sim.settings.choice import ChosenOption
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import FILTERS, SLICERS, SOLVERS, TRACKERS
 from us_sim.settings.setting import Settings, setting
@@ -26,7 +26,7 @@ from us_sim.slicing.settings import (
     Imaging,
     MModeSettings,
     SpectrumSettings,
-    Strain,
+    StrainSettings,
 )
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.mesh.tetrahedral_mesh import MeshSettings
@@ -67,7 +67,7 @@ class TissueSettings(Settings):
     def check(self) -> None:
         """Something is made of something."""
         if not self.materials:
-            raise self.refused("materials", "names no material")
+            raise self.make_error("materials", "names no material")
 
 
 @dataclass(frozen=True)
@@ -96,13 +96,13 @@ class StructureSettings(Settings):
     def check(self) -> None:
         """A label or a file."""
         if self.file and self.flow:
-            raise self.refused(
+            raise self.make_error(
                 "flow", "is for structures around a label, in which there is room for blood"
             )
         if self.file and self.label:
-            raise self.refused("", "has both `file` and `label`; keep one")
+            raise self.make_error("", "has both `file` and `label`; keep one")
         if not self.file and (self.unit != 1.0 or self.pose != Placement()):
-            raise self.refused("", "`unit` and `pose` are for a surface from a `file` only")
+            raise self.make_error("", "`unit` and `pose` are for a surface from a `file` only")
 
 
 @dataclass(frozen=True)
@@ -115,11 +115,11 @@ class TrackerSettings(Settings):
     section = "tracker"
     error = SceneError
 
-    source: Chosen = setting(
+    source: ChosenOption = setting(
         description="where poses come from",
         choice=TRACKERS,
         place="named",
-        default=Chosen("pose"),
+        default=ChosenOption("pose"),
     )
     frame: str = setting(description="of the device, in its messages", default="patient")
     entry: int = setting(
@@ -159,15 +159,15 @@ class TrackerSettings(Settings):
     lost_after: float = setting(
         Quantity("time", 1e-3, 60.0), "without a pose after which it is `lost`", default=1.0
     )
-    filter: Chosen = setting(
-        description="what smooths the poses", choice=FILTERS, default=Chosen("none")
+    filter: ChosenOption = setting(
+        description="what smooths the poses", choice=FILTERS, default=ChosenOption("none")
     )
     gate: GateSettings | None = setting(description="which poses are not believed", default=None)
 
     def check(self) -> None:
         """The times go together."""
         if self.lost_after < self.coast_for:
-            raise self.refused(
+            raise self.make_error(
                 "lost_after",
                 f"{self.lost_after:g} s is less than coast_for, {self.coast_for:g} s: a probe "
                 f"coasts before it is lost",
@@ -207,14 +207,15 @@ class Scene(Settings):
         default_factory=dict,
     )
     skin: SkinSettings | None = setting(description="the skin membrane", default=None)
-    slice: Chosen = setting(
-        description="how the image is cut", choice=SLICERS, default=Chosen("scan_conversion")
+    slice: ChosenOption = setting(
+        description="how the image is cut", choice=SLICERS, default=ChosenOption("scan_conversion")
     )
     imaging: ImagingSettings = setting(
         description="how echoes become grey values", default=ImagingSettings()
     )
-    strain: Strain = setting(
-        description="strain images, where there is tissue and somebody subscribes", default=Strain()
+    strain: StrainSettings = setting(
+        description="strain images, where there is tissue and somebody subscribes",
+        default=StrainSettings(),
     )
     colour: ColourSettings = setting(
         description="the box of colour Doppler, where a structure has a flow",
@@ -251,23 +252,25 @@ class Scene(Settings):
         """Sections that need each other are there."""
         for key, user in (("tissue", "tissue"), ("skin", "skin")):
             if getattr(self, key) is not None and self.probe.collider is None:
-                raise self.refused(
+                raise self.make_error(
                     "probe.collider", f"is missing, and the {user} needs one to press it"
                 )
         if self.structures and self.tissue is None:
-            raise self.refused("structures", "need `tissue` to carry them, and it is missing")
-        if self.strain != Strain() and self.tissue is None:
-            raise self.refused("strain", "needs `tissue` to be strained, and it is missing")
+            raise self.make_error("structures", "need `tissue` to carry them, and it is missing")
+        if self.strain != StrainSettings() and self.tissue is None:
+            raise self.make_error("strain", "needs `tissue` to be strained, and it is missing")
 
-    def parts(self) -> list[Part]:
+    def list_parts(self) -> list[Part]:
         """Every simulation node with the reason why it runs or is left out."""
         is_felt, felt = self.tracker.source.name == "haptic", ("tissue", "nothing can be felt")
         return [
             Part("probe_tracker", True, f"poses come from `{self.tracker.source.name}`"),
-            _part("tissue_deformer", self.tissue, "tissue", "the volume is sliced rigidly"),
-            _part("skin_deformer", self.skin, "skin", "no membrane is computed"),
-            Part("slice_interpolator", True, self._imaged()),
-            *([_part("haptic_renderer", self.tissue, *felt)] if is_felt else []),
+            _optional_part(
+                "tissue_deformer", self.tissue, "tissue", "the volume is sliced rigidly"
+            ),
+            _optional_part("skin_deformer", self.skin, "skin", "no membrane is computed"),
+            Part("slice_interpolator", True, self._describe_imaging()),
+            *([_optional_part("haptic_renderer", self.tissue, *felt)] if is_felt else []),
             *([Part("scorer", True, f"the exercise is {self.exercise}")] if self.exercise else []),
         ]
 
@@ -283,7 +286,7 @@ class Scene(Settings):
         topics += ["tissue/nodes"] if self.tissue else []
         return topics + (["skin/nodes"] if self.skin else [])
 
-    def _imaged(self) -> str:
+    def _describe_imaging(self) -> str:
         """How images are made, for a person."""
         asked = [
             entry.name
@@ -301,7 +304,7 @@ class Scene(Settings):
         return self.tissue.settings.get(name) if self.tissue else None
 
 
-def _part(node: str, section: object | None, key: str, consequence: str) -> Part:
+def _optional_part(node: str, section: object | None, key: str, consequence: str) -> Part:
     if section is None:
         return Part(node, False, f"the scene has no `{key}`: {consequence}")
     return Part(node, True, f"the scene has `{key}`")

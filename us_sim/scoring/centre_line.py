@@ -16,13 +16,13 @@ _PIECE = 2e-3  # m, of the vessel's length, whose voxels give one point of the l
 _SMOOTHED = 5  # points, over which the line is straightened: a surface of voxels is uneven
 
 
-def places_of(volume: Volume, labels: NDArray[np.bool_]) -> NDArray[np.float64]:
+def compute_voxel_centres(volume: Volume, labels: NDArray[np.bool_]) -> NDArray[np.float64]:
     """(N, 3) m, the centres of a volume's marked voxels (i, j, k), in frame ``patient``."""
     matrix = volume.index_to_patient
     return np.asarray(np.argwhere(labels) @ matrix[:3, :3].T + matrix[:3, 3])
 
 
-class Cut(NamedTuple):
+class PlaneCut(NamedTuple):
     """Where a plane cuts a centre line."""
 
     along: float  # m, from the end that is first along the line's main axis
@@ -39,12 +39,12 @@ class CentreLine:
     area: float = 0.0  # m², mean cross-section of the vessel
 
     @classmethod
-    def of(cls, volume: Volume, labels: NDArray[np.bool_]) -> CentreLine | None:
+    def from_labels(cls, volume: Volume, labels: NDArray[np.bool_]) -> CentreLine | None:
         """The line of a volume's marked voxels (i, j, k); None of a structure that is not long.
 
         The voxels are cut across their longest axis, and each piece gives its centroid.
         """
-        places = places_of(volume, labels)
+        places = compute_voxel_centres(volume, labels)
         if len(places) < 2:
             return None
         middle = places.mean(axis=0)
@@ -69,21 +69,21 @@ class CentreLine:
         steps = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
         return np.concatenate([[0.0], np.cumsum(steps)])
 
-    def along(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def find_arc_lengths(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N,) m along the line, of its points nearest to these (N, 3) m."""
         return np.asarray(self.lengths[cKDTree(self.points).query(points)[1]])
 
-    def at(self, along: float) -> NDArray[np.float64]:
+    def interpolate_point(self, along: float) -> NDArray[np.float64]:
         """The point (3,) m of a length along the line."""
         lengths = self.lengths
         return np.array([np.interp(along, lengths, each) for each in self.points.T])
 
-    def cut(self, pose: Pose, width: float) -> Cut | None:
+    def find_cut(self, pose: Pose, width: float) -> PlaneCut | None:
         """Where the image plane of a probe, at most so wide (m), cuts the line below its face.
 
         Of several places the one nearest to the face.
         """
-        seen = pose.inverse().apply(self.points)
+        seen = pose.inverse().transform_points(self.points)
         across = seen[:, 1]
         found = None
         for k in np.flatnonzero(across[1:] * across[:-1] <= 0).tolist():
@@ -96,5 +96,5 @@ class CentreLine:
             length = float(np.linalg.norm(way))
             angle = np.arcsin(min(abs(float(way @ pose.rotation[:, 1])) / length, 1.0))
             where = float(self.lengths[k] + part * length)
-            found = (z, Cut(where, float(angle), float(x), self.points[k] + part * way))
+            found = (z, PlaneCut(where, float(angle), float(x), self.points[k] + part * way))
         return found[1] if found else None

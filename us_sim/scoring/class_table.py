@@ -10,14 +10,14 @@ from typing import Any
 
 import pandas as pd
 
-from us_sim.scoring.result import picture_address
+from us_sim.scoring.result import encode_picture
 
 CLASS_FILES = ("class.csv", "class.html")
 _NOBODY = "somebody"
 _ALT = "Points right of each attempt, over time, for each student"
 
 
-def class_table(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+def tabulate_results(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Return one row for each result: who, what, when, what became of it, and plain metrics.
 
     Args:
@@ -45,7 +45,7 @@ def class_table(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def write_class(table: pd.DataFrame, folder: Path) -> list[Path]:
+def write_class_table(table: pd.DataFrame, folder: Path) -> list[Path]:
     """Write the table as CSV, and as a page with a picture; return the files."""
     files = [folder / name for name in CLASS_FILES]
     folder.mkdir(parents=True, exist_ok=True)
@@ -55,7 +55,7 @@ def write_class(table: pd.DataFrame, folder: Path) -> list[Path]:
         '<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>Class</title>'
         "<style>body {font-family: sans-serif; margin: 2em} td, th {padding: 0.2em 0.8em; "
         "text-align: left} img {max-width: 100%}</style><h1>Class</h1>"
-        f'<p>{escape(_summary(table))}</p><img src="{picture_address(_draw(table))}" alt="{_ALT}">'
+        f'<p>{escape(_summary(table))}</p><img src="{encode_picture(_draw(table))}" alt="{_ALT}">'
         f"{shown.to_html(index=False, border=0)}</html>",
         encoding="utf-8",
     )

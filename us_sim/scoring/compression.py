@@ -78,9 +78,9 @@ class Compression(Task):
     def check(self) -> None:
         """Refuse a task without a point."""
         if self.points in ((), 0):
-            raise self.refused("points", "is empty: name at least one")
+            raise self.make_error("points", "is empty: name at least one")
 
-    def places(self, length: float) -> NDArray[np.float64]:
+    def place_points(self, length: float) -> NDArray[np.float64]:
         """Return the points (N,), m along a vein of that length.
 
         Raises:
@@ -100,11 +100,11 @@ class Compression(Task):
             0.5 * length + spacing * (np.arange(count) - 0.5 * (count - 1)), np.float64
         )
 
-    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:
+    def begin_attempt(self, lines: Mapping[str, CentreLine]) -> Attempt:
         """Return an attempt with a step for each point, and one for the time if it is limited."""
         line = lines[self.structure]
-        places = self.places(float(line.lengths[-1])).tolist()
-        return _Examination(self, [_Point(at, line.at(at)) for at in places])
+        places = self.place_points(float(line.lengths[-1])).tolist()
+        return _Examination(self, [_Point(at, line.interpolate_point(at)) for at in places])
 
 
 class _Look(NamedTuple):
@@ -118,12 +118,12 @@ class _Look(NamedTuple):
     artery: float  # part of the artery's area at rest; 1 where nobody knows
 
     @property
-    def touches(self) -> bool:
+    def is_touching(self) -> bool:
         return not self.force < CONTACT_FORCE
 
-    def presses(self, is_open: float) -> bool:
+    def is_pressing(self, is_open: float) -> bool:
         """Return whether the vein is pressed, by its area or by the force."""
-        return self.touches and (self.part < is_open or self.force >= _LIGHT)
+        return self.is_touching and (self.part < is_open or self.force >= _LIGHT)
 
 
 @dataclass
@@ -152,7 +152,7 @@ class _Press:
     closed: tuple[float, float] | None = None  # N, and the part of the artery that was open
     _closed_since: float | None = field(default=None, repr=False)  # s
 
-    def add(self, look: _Look, task: Compression) -> None:
+    def add_look(self, look: _Look, task: Compression) -> None:
         """Take an image of it."""
         self.most = max(self.most, float(np.nan_to_num(look.peak)))
         if look.part < self.least:
@@ -187,7 +187,7 @@ class _Examination(Attempt):
         self.faults: list[Fault] = []
         self._answer = ""  # where the thrombus is: a point's number, or that there is none
 
-    def answer(self, points: Sequence[str], thrombus: str, time: float) -> None:
+    def set_answers(self, points: Sequence[str], thrombus: str, time: float) -> None:
         """Take the learner's answers; the last one ends the attempt.
 
         Raises:
@@ -195,7 +195,7 @@ class _Examination(Attempt):
         """
         numbers = [str(k + 1) for k in range(len(self._points))]
         if not self.is_blind:
-            super().answer(points, thrombus, time)
+            super().set_answers(points, thrombus, time)
         if self.ended is not None:
             raise ScoreError("answers: the attempt has ended: begin anew")
         if len(points) > len(numbers) or not {*points} <= {*ANSWERS, NO_ANSWER}:
@@ -210,14 +210,18 @@ class _Examination(Attempt):
         if thrombus and all(point.answer for point in self._points):
             self.ended = time
 
-    def take(self, scan: Scan) -> None:
+    def add_samples(self, scan: Scan) -> None:
         """Take the images that are new."""
         task = self._task
         self._thrombus = scan.thrombi.get(task.structure, self._thrombus)
         section, artery = (scan.sections.get(name or "") for name in (task.structure, task.artery))
         if section is None:
             return
-        force = scan.force.at(section.times) if scan.force else np.full(len(section.times), np.nan)
+        force = (
+            scan.force.interpolate_at(section.times)
+            if scan.force
+            else np.full(len(section.times), np.nan)
+        )
         for k in np.flatnonzero(section.times > scan.since).tolist():
             time, peak = float(section.times[k]), float(force[k])
             if self.ended is not None and time > self.ended:
@@ -231,7 +235,7 @@ class _Examination(Attempt):
             self._look(_Look(time, along, part, float(force[k]), peak, float(part_of_artery)))
             self._looked = time
 
-    def steps(self) -> list[Step]:
+    def list_steps(self) -> list[Step]:
         """Return one step for each point, and one for the time if it is limited."""
         pressed = self._pressed()
         steps = []
@@ -285,7 +289,7 @@ class _Examination(Attempt):
         limit = self._task.time_limit
         if limit is None:
             return []
-        seconds = self.seconds() or 0.0
+        seconds = self.compute_duration() or 0.0
         is_kept = seconds <= limit
         return [Step(f"within {limit:g} s", is_kept, f"{seconds:.0f} s", is_missed=not is_kept)]
 
@@ -296,14 +300,14 @@ class _Examination(Attempt):
             self.ended = look.time
             return
         self._along = look.along if np.isfinite(look.along) else self._along
-        presses = look.presses(task.open)
+        presses = look.is_pressing(task.open)
         if self._press is None and presses:
             self._press = _Press(look.along, self._early(look))
         if self._press is not None:
-            self._press.add(look, task)
+            self._press.add_look(look, task)
             self._check_place(look, self._press)
         self._check_force(look)
-        self._was_lifted |= not look.touches
+        self._was_lifted |= not look.is_touching
         if self._press is not None and not presses:
             self._finish(self._press)
         self._see_open(look)
@@ -312,7 +316,7 @@ class _Examination(Attempt):
 
     def _see_open(self, look: _Look) -> None:
         """Note since when, and where, the vein is seen open."""
-        if not look.touches or look.presses(self._task.open):
+        if not look.is_touching or look.is_pressing(self._task.open):
             self._open = None
             return
         is_elsewhere = self._open and abs(look.along - self._open[1]) > self._task.tolerance
@@ -332,7 +336,7 @@ class _Examination(Attempt):
 
     def _check_place(self, look: _Look, press: _Press) -> None:
         slid = abs(look.along - press.along)
-        if look.touches and slid > self._task.tolerance and not press.has_slid:
+        if look.is_touching and slid > self._task.tolerance and not press.has_slid:
             press.has_slid = True
             press.problem = f"slid {_MM * slid:.0f} mm under pressure: let go before you slide on"
             self.faults.append(Fault(look.time, press.problem))

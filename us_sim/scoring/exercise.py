@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 from us_sim.errors import ScoreError
 from us_sim.geometry.pose import Placement, Pose
 from us_sim.scoring.centre_line import CentreLine
-from us_sim.scoring.metrics import Scan, Section
+from us_sim.scoring.metrics import Scan, VesselSection
 from us_sim.scoring.settings import CONTACT_FORCE
-from us_sim.settings.choice import Chosen
+from us_sim.settings.choice import ChosenOption
 from us_sim.settings.quantity import Quantity
-from us_sim.settings.reading import Reader
+from us_sim.settings.reading import SettingsReader
 from us_sim.settings.registry import EXERCISES
 from us_sim.settings.setting import Settings, setting
-from us_sim.settings.spelling import unknown
+from us_sim.settings.spelling import describe_unknown
 from us_sim.settings.text_files import read_yaml
 from us_sim.share import shared_roots
 
@@ -49,7 +49,7 @@ class Step(NamedTuple):
     pose: Pose | None = None  # of the probe, that is to be found
     is_missed: bool = False  # whether it was tried in vain, and the probe has moved on
 
-    def document(self) -> dict[str, Any]:
+    def to_document(self) -> dict[str, Any]:
         """Return it as JSON, with its ``state``: done, missed, or to do."""
         state = "done" if self.is_done else "missed" if self.is_missed else "to do"
         told: dict[str, Any] = {"what": self.what, "state": state, "seen": self.seen}
@@ -86,7 +86,7 @@ class Attempt(ABC):
     """What was done wrong, in order."""
     _time = 0.0  # s, of the last pose
 
-    def add(self, scan: Scan) -> None:
+    def add_scan(self, scan: Scan) -> None:
         """Take the samples that are new, from the first in the air on."""
         times, is_touching = scan.motion.times, np.ones(len(scan.motion), bool)
         if scan.force is not None:
@@ -100,17 +100,17 @@ class Attempt(ABC):
         if self.touched is None:
             touching = times[(times > scan.since) & is_touching]
             self.touched = float(touching[0]) if len(touching) else None
-        self.take(scan)
+        self.add_samples(scan)
 
     @abstractmethod
-    def take(self, scan: Scan) -> None:
+    def add_samples(self, scan: Scan) -> None:
         """Take the samples that are new and count."""
 
     @abstractmethod
-    def steps(self) -> list[Step]:
+    def list_steps(self) -> list[Step]:
         """Return every thing that is to be done."""
 
-    def answer(self, points: Sequence[str], thrombus: str, time: float) -> None:  # noqa: ARG002
+    def set_answers(self, points: Sequence[str], thrombus: str, time: float) -> None:  # noqa: ARG002
         """Take the learner's answers so far.
 
         Args:
@@ -123,7 +123,7 @@ class Attempt(ABC):
         """
         raise ScoreError("answers: this exercise asks nothing")
 
-    def seconds(self) -> float | None:
+    def compute_duration(self) -> float | None:
         """Return the time from the first touch to the end, or so far; None before the first."""
         if self.touched is None:
             return None
@@ -144,7 +144,7 @@ class Task(Settings):
         return ()
 
     @abstractmethod
-    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:
+    def begin_attempt(self, lines: Mapping[str, CentreLine]) -> Attempt:
         """An attempt at it, in a scene with these vessels."""
 
 
@@ -180,7 +180,7 @@ class KeepForce(Task):
     tolerance: float = setting(Quantity(_FORCE, 0.01, 200.0), "above and below", default=1.0)
     duration: float = setting(_TIME, "without leaving it", default=5.0)
 
-    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:  # noqa: ARG002
+    def begin_attempt(self, lines: Mapping[str, CentreLine]) -> Attempt:  # noqa: ARG002
         """An attempt with one step."""
         return _KeptForce(self)
 
@@ -191,14 +191,14 @@ class _KeptForce(_Holding):
         self._task = task
         self._newtons: float | None = None  # the last
 
-    def take(self, scan: Scan) -> None:
+    def add_samples(self, scan: Scan) -> None:
         if scan.force is not None:
             new = scan.force.times > scan.since
             within = np.abs(scan.force.newtons - self._task.force) <= self._task.tolerance
             self._hold(scan.force.times[new], within[new])
             self._newtons = float(scan.force.newtons[-1])
 
-    def steps(self) -> list[Step]:
+    def list_steps(self) -> list[Step]:
         task = self._task
         what = f"{task.force:g} ± {task.tolerance:g} N for {task.duration:g} s"
         if self._newtons is None:
@@ -221,7 +221,7 @@ class Centre(Task):
         """The vessel."""
         return (self.structure,)
 
-    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:
+    def begin_attempt(self, lines: Mapping[str, CentreLine]) -> Attempt:
         """An attempt with one step."""
         return _Centred(self, lines[self.structure])
 
@@ -231,7 +231,7 @@ class _Centred(_Holding):
         super().__init__(task.duration)
         self._task, self._line, self._is_seen = task, line, False
 
-    def take(self, scan: Scan) -> None:
+    def add_samples(self, scan: Scan) -> None:
         section = scan.sections.get(self._task.structure)
         if section is not None:
             new = section.times > scan.since
@@ -239,7 +239,7 @@ class _Centred(_Holding):
             within = _is_centred(section, self._task.offset)
             self._hold(section.times[new], within[new])
 
-    def steps(self) -> list[Step]:
+    def list_steps(self) -> list[Step]:
         task, points = self._task, self._line.points
         what = f"{task.structure} within {_MM * task.offset:g} mm for {task.duration:g} s"
         if not self._is_seen:
@@ -261,7 +261,7 @@ class Follow(Task):
         """The vessel."""
         return (self.structure,)
 
-    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:
+    def begin_attempt(self, lines: Mapping[str, CentreLine]) -> Attempt:
         """An attempt with one step."""
         return _Followed(self, lines[self.structure])
 
@@ -275,7 +275,7 @@ class _Followed(Attempt):
         self._seen = np.zeros(len(self._pieces), bool)
         self._last: float | None = None  # m along the vessel, where it was centred just before
 
-    def take(self, scan: Scan) -> None:
+    def add_samples(self, scan: Scan) -> None:
         section = scan.sections.get(self._task.structure)
         if section is None:
             return
@@ -296,7 +296,7 @@ class _Followed(Attempt):
         """Of the vessel, that was seen."""
         return float(self._seen.mean()) if len(self._seen) else 0.0
 
-    def steps(self) -> list[Step]:
+    def list_steps(self) -> list[Step]:
         part = self._part
         what = f"{100 * self._task.part:.0f} % of the {self._task.structure} in the image's middle"
         return [Step(what, part >= self._task.part, f"{100 * part:.0f} % seen", self._line.points)]
@@ -317,7 +317,7 @@ class View(Task):
         """The vessels that must be seen."""
         return self.visible
 
-    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:  # noqa: ARG002
+    def begin_attempt(self, lines: Mapping[str, CentreLine]) -> Attempt:  # noqa: ARG002
         """An attempt with one step."""
         return _Found(self)
 
@@ -328,7 +328,7 @@ class _Found(_Holding):
         self._task = task
         self._nearest = np.inf, np.inf, np.inf  # how far in all, m, rad
 
-    def take(self, scan: Scan) -> None:
+    def add_samples(self, scan: Scan) -> None:
         task, wanted = self._task, self._task.pose.pose
         new = scan.motion.times > scan.since
         times = scan.motion.times[new]
@@ -350,7 +350,7 @@ class _Found(_Holding):
         far = apart[best] / task.distance + turned[best] / task.angle
         self._nearest = min(self._nearest, (far, apart[best], turned[best]))
 
-    def steps(self) -> list[Step]:
+    def list_steps(self) -> list[Step]:
         task = self._task
         what = f"the view within {_MM * task.distance:g} mm and {np.rad2deg(task.angle):.0f}°"
         held = self._step(f"{what} for {task.duration:g} s")
@@ -368,7 +368,7 @@ class Exercise(Settings):
     error: ClassVar = ScoreError
 
     name: str = setting(description="of the exercise")
-    task: Chosen = setting(choice=EXERCISES)
+    task: ChosenOption = setting(choice=EXERCISES)
     description: str = setting(description="of what is to be done, for the learner", default="")
     scene: str | None = setting(description="scene that it is made for", default=None)
     lesson: int | None = setting(
@@ -392,14 +392,16 @@ class Exercise(Settings):
     def check(self) -> None:
         """Refuse to ask where there is no question."""
         if self.feedback == "afterwards" and not self.assigned.asks:
-            raise self.refused("feedback", "afterwards is for a compression, which has questions")
+            raise self.make_error(
+                "feedback", "afterwards is for a compression, which has questions"
+            )
 
     @property
     def assigned(self) -> Any:
         """The task with its settings."""
-        return self.task.settings(EXERCISES)
+        return self.task.resolve_settings(EXERCISES)
 
-    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:
+    def begin_attempt(self, lines: Mapping[str, CentreLine]) -> Attempt:
         """Return an attempt at it, in a scene with these vessels.
 
         Raises:
@@ -407,22 +409,22 @@ class Exercise(Settings):
         """
         for name in self.assigned.structures:
             if name not in lines:
-                known = unknown(name, lines) if lines else f"{name!r} is not known"
+                known = describe_unknown(name, lines) if lines else f"{name!r} is not known"
                 of = "the vessels of the scene" if lines else "a scan without a scene"
                 raise ScoreError(f"exercise {self.name}: in {of} the structure {known}")
         attempt: Attempt = self.assigned.begin(lines)
         attempt.is_blind = self.feedback == "afterwards"
         return attempt
 
-    def steps(self, scan: Scan) -> list[Step]:
+    def evaluate_scan(self, scan: Scan) -> list[Step]:
         """Steps to be done, with what was seen of each in a whole scan.
 
         Raises:
-            ScoreError: as `begin`.
+            ScoreError: as `begin_attempt`.
         """
-        attempt = self.begin(scan.lines)
-        attempt.add(scan)
-        return attempt.steps()
+        attempt = self.begin_attempt(scan.lines)
+        attempt.add_scan(scan)
+        return attempt.list_steps()
 
 
 def read_exercise(name: str | Path) -> Exercise:
@@ -433,28 +435,30 @@ def read_exercise(name: str | Path) -> Exercise:
     """
     path = Path(os.path.expanduser(name))
     if not path.is_file():
-        known = installed_files()
+        known = find_exercise_files()
         if str(name) not in known:
-            raise ScoreError(f"exercise {unknown(str(name), sorted(known))}")
+            raise ScoreError(f"exercise {describe_unknown(str(name), sorted(known))}")
         path = known[str(name)]
-    exercise = Reader(str(path), None, ScoreError).read(Exercise, read_yaml(path, ScoreError))
+    exercise = SettingsReader(str(path), None, ScoreError).read(
+        Exercise, read_yaml(path, ScoreError)
+    )
     checksum = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
     return replace(exercise, origin=str(path.resolve()), checksum=checksum)
 
 
-def installed_exercises() -> list[Exercise]:
+def read_installed_exercises() -> list[Exercise]:
     """Read those in ``config/exercises``: the lesson in its order, then the others by name."""
-    found = [read_exercise(file) for file in installed_files().values()]
+    found = [read_exercise(file) for file in find_exercise_files().values()]
     return sorted(found, key=lambda each: (each.lesson or len(found) + 1, each.name))
 
 
-def installed_files() -> dict[str, Path]:
+def find_exercise_files() -> dict[str, Path]:
     """Return the files in ``config/exercises`` by the names of their exercises."""
     return {
         f.stem: f for root in shared_roots() for f in (root / "config/exercises").glob("*.yaml")
     }
 
 
-def _is_centred(section: Section, offset: float) -> NDArray[np.bool_]:
+def _is_centred(section: VesselSection, offset: float) -> NDArray[np.bool_]:
     with np.errstate(invalid="ignore"):
         return np.asarray(np.abs(section.lateral) <= offset)

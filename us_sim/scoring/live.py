@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from us_sim.errors import ScoreError
 from us_sim.geometry.pose import Pose
 from us_sim.scoring.exercise import Attempt, Exercise, Fault, Step
-from us_sim.scoring.lumen import LumenMeter, lumens_of, vessels_in
+from us_sim.scoring.lumen import LumenMeter, find_lumen_labels, find_vessels
 from us_sim.scoring.metrics import Force, Metric, Scan, Tally
 from us_sim.scoring.motion import Motion
 from us_sim.scoring.settings import ScoreSettings
@@ -59,8 +59,8 @@ class LiveScan:
         exercise: Exercise | None = None,
         limits: ScoreSettings | None = None,
     ) -> None:
-        self.lines, self._thrombi = vessels_in(volume)
-        self._lumens = lumens_of(volume.label_names) if self.lines else {}
+        self.lines, self._thrombi = find_vessels(volume)
+        self._lumens = find_lumen_labels(volume.label_names) if self.lines else {}
         self._scanner, self._exercise, self._limits = scanner, exercise, limits
         self.clear()
 
@@ -73,7 +73,9 @@ class LiveScan:
         self._meter = LumenMeter(self._lumens, self._scanner, lines=self.lines)
         self._settled = -np.inf  # s, until when samples are in the tally and the attempt
         self._tally = Tally(self._limits)
-        self._attempt = self._exercise.begin(self.lines) if self._exercise is not None else None
+        self._attempt = (
+            self._exercise.begin_attempt(self.lines) if self._exercise is not None else None
+        )
 
     def add_pose(self, time: float, pose: Pose) -> None:
         """Take a pose of the probe at a time (s) after those before; others are passed over."""
@@ -90,22 +92,24 @@ class LiveScan:
     def add_labels(self, time: float, pose: Pose, labels: NDArray[np.uint8]) -> None:
         """Take the labels (rows, columns) of an image, likewise."""
         if self._lumens and self._is_next(self._meter.times, time):
-            self._meter.add(time, pose, labels)
+            self._meter.add_image(time, pose, labels)
 
-    def answer(self, points: Sequence[str], thrombus: str) -> None:
-        """Take the learner's answers so far, see `Attempt.answer`.
+    def set_answers(self, points: Sequence[str], thrombus: str) -> None:
+        """Take the learner's answers so far, see `Attempt.set_answers`.
 
         Raises:
             ScoreError: nothing is asked, or an answer will not do.
         """
         if self._attempt is None:
             raise ScoreError("answers: no exercise is followed")
-        self._attempt.answer(points, thrombus, self._pose_times[-1] if self._pose_times else 0.0)
+        self._attempt.set_answers(
+            points, thrombus, self._pose_times[-1] if self._pose_times else 0.0
+        )
 
     def _is_next(self, times: list[float], time: float) -> bool:
         return time > self._settled and not (times and time <= times[-1])
 
-    def scan(self, since: float = -np.inf, until: float = np.inf) -> Scan | None:
+    def build_scan(self, since: float = -np.inf, until: float = np.inf) -> Scan | None:
         """All so far, or a piece; None before there is a motion, or while a force is alone.
 
         Args:
@@ -129,28 +133,28 @@ class LiveScan:
         elif end > begin and self._force_times[begin] > since and until < np.inf:
             return None
         width = self._scanner.probe.width
-        sections = self._meter.sections(*_span(self._meter.times, since, until, 1))
+        sections = self._meter.collect_sections(*_span(self._meter.times, since, until, 1))
         return Scan(motion, force, sections, self.lines, self._thrombi, width, since=since)
 
-    def score(self) -> Score | None:
+    def compute_score(self) -> Score | None:
         """Return the score so far; None before there is a motion."""
         self._settle()
-        scan = self.scan(self._settled)
+        scan = self.build_scan(self._settled)
         if scan is None:
             return None
         tally, attempt = deepcopy((self._tally, self._attempt))
         _add(tally, attempt, scan)
-        metrics = list(tally.metrics())
+        metrics = list(tally.list_metrics())
         if attempt is None:
             return Score(metrics)
-        seconds, has_ended = attempt.seconds(), attempt.ended is not None
+        seconds, has_ended = attempt.compute_duration(), attempt.ended is not None
         was_in_air = attempt.was_in_air
-        return Score(metrics, attempt.steps(), attempt.faults, seconds, has_ended, was_in_air)
+        return Score(metrics, attempt.list_steps(), attempt.faults, seconds, has_ended, was_in_air)
 
     def _settle(self) -> None:
         """Add what later samples cannot change any more."""
         until = self._end()
-        piece = self.scan(self._settled, until) if until > self._settled else None
+        piece = self.build_scan(self._settled, until) if until > self._settled else None
         if piece is not None:
             _add(self._tally, self._attempt, piece)
             self._settled = until
@@ -183,6 +187,6 @@ def _span(times: list[float], since: float, until: float, before: int) -> tuple[
 
 
 def _add(tally: Tally, attempt: Attempt | None, scan: Scan) -> None:
-    tally.add(scan)
+    tally.add_scan(scan)
     if attempt is not None:
-        attempt.add(scan)
+        attempt.add_scan(scan)

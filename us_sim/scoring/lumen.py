@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
 from us_sim.geometry.pose import Pose
-from us_sim.scoring.centre_line import CentreLine, places_of
-from us_sim.scoring.metrics import Section
+from us_sim.scoring.centre_line import CentreLine, compute_voxel_centres
+from us_sim.scoring.metrics import VesselSection
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.probe.probe import Probe
-from us_sim.tissue.elasticity.material import kind_of
+from us_sim.tissue.elasticity.material import guess_tissue_kind
 from us_sim.volume.volume import Volume
 
 VESSELS = ("vein", "artery")  # kinds of tissue whose cross-sections are measured
@@ -25,16 +25,16 @@ _STEEPEST = 0.2
 """Cosine of a probe's tilt; beyond it, how far it would have to be lifted means nothing."""
 
 
-def lifted(pose: Pose) -> Pose:
+def lift_probe(pose: Pose) -> Pose:
     """Lift a probe within its image plane until it does not press into z > 0."""
     depth = max(float(pose.position[2]), 0.0) / max(float(pose.rotation[2, 2]), _STEEPEST)
     return Pose(pose.position - depth * pose.rotation[:, 2], pose.orientation)
 
 
-def lumens_of(label_names: Mapping[int, str]) -> dict[str, tuple[int, ...]]:
+def find_lumen_labels(label_names: Mapping[int, str]) -> dict[str, tuple[int, ...]]:
     """Labels of the inside of each vessel, veins first; a ``vein thrombus`` fills part of ``vein``.
 
-    >>> lumens_of({5: "artery", 6: "vein", 8: "vein thrombus"})
+    >>> find_lumen_labels({5: "artery", 6: "vein", 8: "vein thrombus"})
     {'vein': (6, 8), 'artery': (5,)}
     """
     labels = {name: label for label, name in label_names.items()}
@@ -42,11 +42,11 @@ def lumens_of(label_names: Mapping[int, str]) -> dict[str, tuple[int, ...]]:
         name: tuple(labels[part] for part in (name, f"{name} thrombus") if part in labels)
         for kind in VESSELS
         for name in labels
-        if kind_of(name) == kind
+        if guess_tissue_kind(name) == kind
     }
 
 
-def vessels_in(volume: Volume) -> tuple[dict[str, CentreLine], dict[str, tuple[float, float]]]:
+def find_vessels(volume: Volume) -> tuple[dict[str, CentreLine], dict[str, tuple[float, float]]]:
     """Centre lines of vessels by their names, and where along them a thrombus is (m, from, to).
 
     A vessel that is not long has none.
@@ -55,14 +55,14 @@ def vessels_in(volume: Volume) -> tuple[dict[str, CentreLine], dict[str, tuple[f
     thrombi: dict[str, tuple[float, float]] = {}
     if volume.labels is None:
         return lines, thrombi
-    for name, numbers in lumens_of(volume.label_names).items():
-        line = CentreLine.of(volume, np.isin(volume.labels, numbers))
+    for name, numbers in find_lumen_labels(volume.label_names).items():
+        line = CentreLine.from_labels(volume, np.isin(volume.labels, numbers))
         if line is None:
             continue
         lines[name] = line
         clot = np.isin(volume.labels, numbers[1:])
         if clot.any():
-            along = line.along(places_of(volume, clot))
+            along = line.find_arc_lengths(compute_voxel_centres(volume, clot))
             thrombi[name] = float(along.min()), float(along.max())
     return lines, thrombi
 
@@ -82,7 +82,7 @@ class LumenAreas:
         """The first sample within 1 % of the deepest press."""
         return int(np.argmax(self.depth >= 0.99 * self.depth.max()))
 
-    def fraction(self, vessel: str) -> NDArray[np.float64]:
+    def compute_fraction(self, vessel: str) -> NDArray[np.float64]:
         """(K,) area over that of the same plane at rest; NaN where there is nothing to compare."""
         return np.asarray(self.area[vessel] / self.at_rest[vessel])
 
@@ -99,7 +99,7 @@ class LumenMeter:
         lumens: labels of each vessel by its name.
         scanner: that finds labels.
         rest: (N, 3) m, nodes of the mesh that the scanner carries; None where it carries none.
-        lines: centre lines by the vessels' names, for `sections`.
+        lines: centre lines by the vessels' names, for `collect_sections`.
     """
 
     def __init__(
@@ -121,21 +121,21 @@ class LumenMeter:
         self._found: list[list[list[float]]] = []  # m², now and at rest, by vessel
         self._whole: list[NDArray[np.bool_]] = []  # in the image, by vessel
 
-    def add(self, time: float, pose: Pose, labels: NDArray[np.uint8]) -> None:
+    def add_image(self, time: float, pose: Pose, labels: NDArray[np.uint8]) -> None:
         """Measure an image, of the labels (rows, columns) that it shows."""
-        above = lifted(pose)
-        seen = labels, self._scanner.labels(above, self._rest)
+        above = lift_probe(pose)
+        seen = labels, self._scanner.render_labels(above, self._rest)
         inside = [[np.isin(each, n) for n in self._lumens.values()] for each in seen]
         self.times.append(time)
         self._depth.append(float(pose.position[2]))
         for name, line in self._lines.items():
-            cut = line.cut(above, self._scanner.probe.width)
+            cut = line.find_cut(above, self._scanner.probe.width)
             place = (cut.along, cut.angle, cut.lateral) if cut else (np.nan,) * 3
             self._cuts[name].append(place)
         self._found.append([[self._pixel * float(v.sum()) for v in each] for each in inside])
         self._whole.append(~np.any([[v[self._edge].any() for v in each] for each in inside], 0))
 
-    def areas(self) -> LumenAreas | None:
+    def collect_areas(self) -> LumenAreas | None:
         """All that were measured; None where no vessel was cut that can be compared."""
         if not self.times:
             return None
@@ -168,14 +168,14 @@ class LumenMeter:
         now, rest = self._found[sample]
         return not any(n == 0.0 and r > 0.0 for n, r in zip(now, rest, strict=True))
 
-    def sections(self, begin: int = 0, end: int | None = None) -> dict[str, Section]:
+    def collect_sections(self, begin: int = 0, end: int | None = None) -> dict[str, VesselSection]:
         """Areas and places of the vessels that have a centre line, of these samples."""
         times = np.array(self.times[begin:end])
         if not len(times):
             return {}
         areas = dict(zip(self._lumens, zip(*self._compared(begin, end), strict=True), strict=True))
         return {
-            name: Section(times, *areas[name], *np.array(cuts[begin:end]).T)
+            name: VesselSection(times, *areas[name], *np.array(cuts[begin:end]).T)
             for name, cuts in self._cuts.items()
         }
 

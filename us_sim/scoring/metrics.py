@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import ScoreError
 from us_sim.scoring.centre_line import CentreLine
-from us_sim.scoring.motion import ACTION_SPEED, ACTION_TURN, Actions, Motion
+from us_sim.scoring.motion import ACTION_SPEED, ACTION_TURN, ActionCounter, Motion
 from us_sim.scoring.settings import CONTACT_FORCE, ScoreSettings
 
 _Array = NDArray[np.float64]
@@ -88,14 +88,14 @@ class Force:
         if self.times.shape != self.newtons.shape or len(self.times) < 2:
             raise ScoreError("a force over time needs two samples, and a time for each")
 
-    def at(self, times: _Array) -> _Array:
+    def interpolate_at(self, times: _Array) -> _Array:
         """The force at other times, linear in between; NaN before the first and after the last."""
         found = np.interp(times, self.times, self.newtons, left=np.nan, right=np.nan)
         return np.asarray(found, np.float64)
 
 
 @dataclass(frozen=True)
-class Section:
+class VesselSection:
     """A vessel's cross-section in the image over time; NaN where the image does not show it."""
 
     times: _Array  # (K,) s
@@ -121,7 +121,7 @@ class Scan:
 
     motion: Motion  # of the probe in frame ``patient``
     force: Force | None = None
-    sections: Mapping[str, Section] = field(default_factory=dict)  # by the vessel's name
+    sections: Mapping[str, VesselSection] = field(default_factory=dict)  # by the vessel's name
     lines: Mapping[str, CentreLine] = field(default_factory=dict)  # of all vessels of the scene
     # (from, to) m along the line of a vessel, by its name, where a thrombus is in it
     thrombi: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -130,15 +130,15 @@ class Scan:
     missing: tuple[str, ...] = ()  # metrics that cannot be told, and why, in sentences
     since: float = -np.inf  # s
 
-    def new(self, times: _Array, *values: _Array) -> list[_Array]:
+    def select_new(self, times: _Array, *values: _Array) -> list[_Array]:
         """The last of each values, for as many samples as are new by their times."""
         count = int(np.count_nonzero(times > self.since))
         return [each[max(len(each) - count, 0) :] for each in values]
 
 
-def metrics_of(scan: Scan, settings: ScoreSettings | None = None) -> Iterator[Metric]:
+def compute_metrics(scan: Scan, settings: ScoreSettings | None = None) -> Iterator[Metric]:
     """All metrics that the scan has data for, in the order of a report."""
-    return Tally(settings).add(scan).metrics()
+    return Tally(settings).add_scan(scan).list_metrics()
 
 
 class Tally:
@@ -148,12 +148,12 @@ class Tally:
         self._settings = settings or ScoreSettings()
         self._sums: defaultdict[str, float] = defaultdict(float)
         self._extremes: defaultdict[str, float] = defaultdict(float)
-        self._translation, self._rotation = Actions(), Actions()
+        self._translation, self._rotation = ActionCounter(), ActionCounter()
         self._of_vessels: dict[str, Tally] = {}
         self._is_touching = False  # at the last pose
         self._frozen: int | None = None
 
-    def add(self, scan: Scan) -> Tally:
+    def add_scan(self, scan: Scan) -> Tally:
         """Take the samples that are new."""
         self._add_motion(scan)
         if scan.force is not None:
@@ -165,7 +165,7 @@ class Tally:
         self._frozen = scan.frozen
         return self
 
-    def metrics(self) -> Iterator[Metric]:
+    def list_metrics(self) -> Iterator[Metric]:
         """All that there are data for, in the order of a report."""
         yield from self._of_motion()
         if "impulse" in self._sums:
@@ -187,7 +187,7 @@ class Tally:
 
     def _add_motion(self, scan: Scan) -> None:
         motion = scan.motion
-        times, steps, speeds, turns, jerks, accelerations = scan.new(
+        times, steps, speeds, turns, jerks, accelerations = scan.select_new(
             motion.times,
             motion.times[1:],
             motion.steps,
@@ -203,8 +203,8 @@ class Tally:
         self._peak("acceleration", accelerations)
         if len(steps):
             begin = float(times[0] - steps[0])
-            self._translation.add(times, speeds > ACTION_SPEED, begin)
-            self._rotation.add(times, turns > ACTION_TURN, begin)
+            self._translation.add_steps(times, speeds > ACTION_SPEED, begin)
+            self._rotation.add_steps(times, turns > ACTION_TURN, begin)
 
     def _of_motion(self) -> Iterator[Metric]:
         total = self._sums
@@ -229,7 +229,7 @@ class Tally:
 
     def _add_force(self, scan: Scan, force: Force) -> None:
         """Means over time, the force linear between two samples, which count as the later one."""
-        steps, during, ends = scan.new(
+        steps, during, ends = scan.select_new(
             force.times,
             np.diff(force.times),
             0.5 * (force.newtons[1:] + force.newtons[:-1]),
@@ -241,13 +241,13 @@ class Tally:
         self._peak("force", force.newtons)
         if scan.width is not None:
             motion = scan.motion
-            at_poses = force.at(motion.times) >= CONTACT_FORCE
+            at_poses = force.interpolate_at(motion.times) >= CONTACT_FORCE
             old = len(motion) - np.count_nonzero(motion.times > scan.since)
             at_poses[:old] = False
             if old:
                 at_poses[old - 1] = self._is_touching
             self._is_touching = bool(at_poses[-1])
-            self._sum(area=motion.face_area(scan.width, at_poses))
+            self._sum(area=motion.compute_face_area(scan.width, at_poses))
 
     def _of_force(self) -> Iterator[Metric]:
         total = self._sums
@@ -259,8 +259,10 @@ class Tally:
         yield Metric(f"Time above {self._settings.force_limit:g} N", "s", total["above"])
         yield Metric("Force Impulse", "N s", total["impulse"])
 
-    def _add_section(self, scan: Scan, section: Section) -> None:
-        area, rest, angle = scan.new(section.times, section.area, section.at_rest, section.angle)
+    def _add_section(self, scan: Scan, section: VesselSection) -> None:
+        area, rest, angle = scan.select_new(
+            section.times, section.area, section.at_rest, section.angle
+        )
         known = np.isfinite(area / rest)
         angles = angle[np.isfinite(angle)]
         self._sum(known=known.sum(), rest=rest[known].sum())

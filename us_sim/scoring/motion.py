@@ -98,7 +98,7 @@ class Motion:
         jerk = np.diff(self.accelerations, axis=0) / steps[:, None]
         return np.asarray((jerk**2).sum(axis=1) * steps)
 
-    def swept_area(
+    def compute_swept_area(
         self, ends: ArrayLike, where: ArrayLike | None = None, facing: _Array | None = None
     ) -> float:
         """Area m² that a line sweeps which leads from each position to an end (K, 3) m.
@@ -118,15 +118,17 @@ class Motion:
                 area += np.abs((normal * facing[1:]).sum(axis=1))
         return float(area[inside[1:] & inside[:-1]].sum())
 
-    def face_area(self, width: float, where: ArrayLike | None = None) -> float:
+    def compute_face_area(self, width: float, where: ArrayLike | None = None) -> float:
         """Area m² of the skin over which a probe's face of this width (m, along x) slides."""
         rotation = Rotation.from_quat(self.orientations)
         half = 0.5 * width * rotation.apply([1.0, 0.0, 0.0])
         side = Motion(self.times, self.positions - half, self.orientations)
-        return side.swept_area(self.positions + half, where, rotation.apply([0.0, 0.0, 1.0]))
+        return side.compute_swept_area(
+            self.positions + half, where, rotation.apply([0.0, 0.0, 1.0])
+        )
 
 
-class Actions:
+class ActionCounter:
     """Number of actions of a motion that comes in pieces.
 
     A change counts once it has lasted longer than the pause.
@@ -137,7 +139,7 @@ class Actions:
         self._is_acting = False
         self._since: float | None = None  # s
 
-    def add(self, times: _Array, is_fast: NDArray[np.bool_], begin: float) -> Actions:
+    def add_steps(self, times: _Array, is_fast: NDArray[np.bool_], begin: float) -> ActionCounter:
         """Take the ends (K,) s of steps, the begin of the first, and whether each was fast."""
         since = begin if self._since is None else self._since
         for time, fast in zip(times.tolist(), is_fast.tolist(), strict=True):

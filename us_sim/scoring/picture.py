@@ -10,7 +10,7 @@ import numpy as np
 
 from us_sim.scoring.exercise import Step
 from us_sim.scoring.metrics import Scan
-from us_sim.volume.structure_names import anatomical_colour
+from us_sim.volume.structure_names import choose_colour
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,13 +53,13 @@ def _draw_way(axes: Axes, scan: Scan, steps: Sequence[Step]) -> None:
     if force is None:
         axes.plot(x, y, color="C0", lw=1.2, zorder=2)
     else:
-        newtons = force.at(motion.times)
+        newtons = force.interpolate_at(motion.times)
         upwards = np.argsort(newtons)  # the strongest on top
         shown = axes.scatter(x[upwards], y[upwards], 9, newtons[upwards], cmap="viridis")
         axes.figure.colorbar(shown, ax=axes, label="force, N", shrink=0.7)
     for name, line in scan.lines.items():
         way = _MM * line.points[:, :2].T
-        axes.plot(*way, color=anatomical_colour(name), lw=3, alpha=0.5, label=name, zorder=0)
+        axes.plot(*way, color=choose_colour(name), lw=3, alpha=0.5, label=name, zorder=0)
     for step in steps:
         if step.target is not None and len(step.target) == 1:
             x, y = _MM * step.target[0, :2]
@@ -81,7 +81,7 @@ def _draw_areas(axes: Axes, scan: Scan) -> None:
     for name, section in scan.sections.items():
         if np.isfinite(section.fraction).any():
             label = f"{name}, % of its area at rest"
-            colour = anatomical_colour(name)
+            colour = choose_colour(name)
             axes.plot(section.times, 100 * section.fraction, color=colour, label=label)
     axes.set_ylim(bottom=0)
     axes.legend(fontsize=8, frameon=False)

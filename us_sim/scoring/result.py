@@ -31,7 +31,7 @@ _STYLE = (
 _ALT = "The probe's way over the skin, with the force; force and areas of vessels over time"
 
 
-def plain_metrics(score: Score, force_limit: float) -> list[Metric]:
+def select_plain_metrics(score: Score, force_limit: float) -> list[Metric]:
     """Return the five that are read first: time, force, time over its limit, way, points."""
     known = {each.name: each.value for each in score.metrics}
     over = f"Time above {force_limit:g} N"
@@ -46,7 +46,7 @@ def plain_metrics(score: Score, force_limit: float) -> list[Metric]:
     ]
 
 
-def state_of(score: Score, void: str = "") -> str:
+def classify_attempt(score: Score, void: str = "") -> str:
     """Return what became of an attempt, one of `STATES`."""
     if void:
         return "void"
@@ -57,7 +57,7 @@ def state_of(score: Score, void: str = "") -> str:
     return "running"
 
 
-def result_page(result: Mapping[str, Any], picture: bytes = b"") -> str:
+def render_page(result: Mapping[str, Any], picture: bytes = b"") -> str:
     """Return the result as a page in one file.
 
     Args:
@@ -68,7 +68,7 @@ def result_page(result: Mapping[str, Any], picture: bytes = b"") -> str:
     steps = [(MARKS[s["state"]], s["what"], s["seen"]) for s in result["steps"]]
     faults = [(f"{each['seconds']} s", each["what"]) for each in result["faults"]]
     more = [(label, text, _definition_of(label)) for label, text in result["metrics"].items()]
-    shown = f'<img src="{picture_address(picture)}" alt="{_ALT}">' if picture else ""
+    shown = f'<img src="{encode_picture(picture)}" alt="{_ALT}">' if picture else ""
     return (
         f'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
         f"<style>{_STYLE}</style><h1>{title}</h1>"
@@ -81,7 +81,7 @@ def result_page(result: Mapping[str, Any], picture: bytes = b"") -> str:
     )
 
 
-def picture_address(picture: bytes) -> str:
+def encode_picture(picture: bytes) -> str:
     """Return a PNG as an address that holds it."""
     return f"data:image/png;base64,{base64.b64encode(picture).decode()}"
 

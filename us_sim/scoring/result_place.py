@@ -54,12 +54,12 @@ class ResultPlace:
         Raises:
             ScoreError: they cannot be written; the sentence names the file that has them meanwhile.
         """
-        from us_sim.scoring.result import result_page  # it brings scipy, which only this takes
+        from us_sim.scoring.result import render_page  # it brings scipy, which only this takes
 
         about = result["about"]
         words = (about.get("student") or "somebody", result["name"], about["begun"])
         name = "-".join(re.sub(r"[^\w.]+", "_", each).strip("_") for each in words)
-        page, document = result_page(result, picture), json.dumps(result, indent=2)
+        page, document = render_page(result, picture), json.dumps(result, indent=2)
         texts = {f"{name}.html": page, f"{name}.json": document}
         try:
             return _write_files(self._address, texts)

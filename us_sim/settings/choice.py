@@ -28,7 +28,7 @@ from typing import Any
 
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.settings.setting import Settings
-from us_sim.settings.spelling import unknown
+from us_sim.settings.spelling import describe_unknown
 
 _logger = logging.getLogger(__name__)
 
@@ -47,9 +47,9 @@ class Option:
         Raises:
             SettingsError: a package that adds it cannot be imported.
         """
-        return self._imported(self.target)
+        return self._import(self.target)
 
-    def docstring(self) -> str | None:
+    def read_docstring(self) -> str | None:
         """Read the docstring of the class, without importing it: that may need rclpy."""
         module, _, name = self.target.partition(":")
         spec = importlib.util.find_spec(module)
@@ -62,7 +62,7 @@ class Option:
     def load_settings(self) -> type[Settings]:
         """Import the settings."""
         if self.settings is not None:
-            found: type[Settings] = self._imported(self.settings)
+            found: type[Settings] = self._import(self.settings)
             return found
         target = self.load()
         if isinstance(target, type) and issubclass(target, Settings):
@@ -72,7 +72,7 @@ class Option:
             raise SettingsError(f"{self.target}: its `Settings` is no us_sim settings class")
         return own
 
-    def _imported(self, target: str) -> Any:
+    def _import(self, target: str) -> Any:
         module, _, name = target.partition(":")
         if self.package is None:
             return getattr(importlib.import_module(module), name)
@@ -150,34 +150,34 @@ class Choice:
                     _logger.warning("%s; there is no %s %s here", error, self.what, name)
         return tuple(name for name, option in self.options.items() if option not in self._broken)
 
-    def option(self, name: str) -> Option:
+    def get_option(self, name: str) -> Option:
         """Where the option of that name is.
 
         Raises:
             SettingsError: or the choice's own error: there is none; the sentence says which are.
         """
         if name not in self.options:
-            raise self._error(f"{self.what} {unknown(name, self.names)}")
+            raise self._error(f"{self.what} {describe_unknown(name, self.names)}")
         return self.options[name]
 
     def load(self, name: str) -> Any:
         """The class of that name, imported now.
 
         Raises:
-            SettingsError: see `option`.
+            SettingsError: see `get_option`.
         """
-        return self.option(name).load()
+        return self.get_option(name).load()
 
-    def settings(self, name: str) -> type[Settings]:
+    def load_settings(self, name: str) -> type[Settings]:
         """The settings class of that name, imported now.
 
         Raises:
-            SettingsError: see `option`.
+            SettingsError: see `get_option`.
         """
-        return self.option(name).load_settings()
+        return self.get_option(name).load_settings()
 
     @property
-    def in_short(self) -> dict[str, str]:
+    def summaries(self) -> dict[str, str]:
         """Descriptions of the options that can be imported, by name; imports all of them."""
         if not self._described:
             return {}
@@ -189,12 +189,12 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Chosen:
+class ChosenOption:
     """A name that was chosen, with the settings that were given for it, if any were."""
 
     name: str
     given: Settings | None = None
 
-    def settings(self, choice: Choice) -> Any:
+    def resolve_settings(self, choice: Choice) -> Any:
         """The settings that were given, or those that it has by default."""
-        return self.given if self.given is not None else choice.settings(self.name)()
+        return self.given if self.given is not None else choice.load_settings(self.name)()

@@ -1,13 +1,13 @@
 """Numbers with units: read as a person writes them in a scene, and shown in handy units.
 
->>> from us_sim.settings.quantity import Quantity, amount, dial_unit, span
+>>> from us_sim.settings.quantity import Quantity, format_quantity, choose_dial_unit, format_range
 >>> Quantity("length", minimum=0.0, maximum=1.0).parse("40 mm")
 0.04
->>> amount(0.0003, "length"), amount(12e3, "pressure"), amount(2.0, "number")
+>>> format_quantity(0.0003, "length"), format_quantity(12e3, "pressure"), format_quantity(2.0, "number")
 ('0.3 mm', '12 kPa', '2')
->>> span(Quantity("length", 0.003, 0.2)), span(Quantity("level", -60.0, 0.0))
+>>> format_range(Quantity("length", 0.003, 0.2)), format_range(Quantity("level", -60.0, 0.0))
 ('3 to 200 mm', '-60 to 0 dB')
->>> dial_unit(Quantity("frequency", 5e5, 5e7)), dial_unit(Quantity("rate", 0.02, 5.0))
+>>> choose_dial_unit(Quantity("frequency", 5e5, 5e7)), choose_dial_unit(Quantity("rate", 0.02, 5.0))
 ('MHz', '/min')
 """
 
@@ -17,7 +17,7 @@ import math
 import re
 from dataclasses import dataclass
 
-from us_sim.settings.spelling import shown
+from us_sim.settings.spelling import short_repr
 
 _UNITS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
@@ -78,29 +78,31 @@ class Quantity:
         Raises:
             ValueError: not a number, a unit of another dimension, not finite, or out of range.
         """
-        number = self._number(value)
+        number = self._read_number(value)
         if not math.isfinite(number):
-            raise ValueError(f"{shown(value)} is not finite; give {self._range}")
+            raise ValueError(f"{short_repr(value)} is not finite; give {self._range}")
         if not self.minimum <= number <= self.maximum:
             unit = f" {self.unit}" if self.unit else ""
-            raise ValueError(f"{number:g}{unit} is outside {self._range}{self._hint(number)}")
+            raise ValueError(
+                f"{number:g}{unit} is outside {self._range}{self._suggest_unit(number)}"
+            )
         return number
 
-    def _number(self, value: object) -> float:
+    def _read_number(self, value: object) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float | str):
-            raise ValueError(self._misfit(value))
+            raise ValueError(self._describe_misfit(value))
         if not isinstance(value, str):
             # A whole number may be larger than any that a float holds.
             return float(value) if abs(value) < 1e308 else math.inf
         match = _NUMBER.match(value)
         units = _UNITS[self.dimension]
         if match is None:
-            raise ValueError(self._misfit(value))
+            raise ValueError(self._describe_misfit(value))
         number, unit = float(match[1]), match[2]
         if not unit:
             return number
         if unit not in units:
-            raise ValueError(self._misfit(value))
+            raise ValueError(self._describe_misfit(value))
         return number * units[unit]
 
     @property
@@ -108,7 +110,7 @@ class Quantity:
         unit = f" {self.unit}" if self.unit else ""
         return f"{self.minimum:g} to {self.maximum:g}{unit}"
 
-    def _misfit(self, value: object) -> str:
+    def _describe_misfit(self, value: object) -> str:
         """That a value is none of this dimension in one of the units that can be written."""
         article = "an" if self.dimension[0] in "aeiou" else "a"
         units = list(_UNITS[self.dimension])
@@ -116,9 +118,9 @@ class Quantity:
             hint = f" in {' or '.join(filter(None, [', '.join(units[:-1]), units[-1]]))}"
         else:
             hint = ": it has no unit" if isinstance(value, str) and _NUMBER.match(value) else ""
-        return f"{shown(value)} is not {article} {self.dimension}{hint}"
+        return f"{short_repr(value)} is not {article} {self.dimension}{hint}"
 
-    def _hint(self, number: float) -> str:
+    def _suggest_unit(self, number: float) -> str:
         """A likely unit slip: the unit with which the number is most in the middle of the range."""
         meant = {
             unit: number * factor
@@ -151,16 +153,16 @@ _EXACT = 1e-12
 """How far, relatively, a number in another unit may be from the number: only by rounding."""
 
 
-def amount(value: float, dimension: str) -> str:
+def format_quantity(value: float, dimension: str) -> str:
     """The number with its unit, as `Quantity.parse` reads it."""
-    number, unit = _split(value, dimension)
+    number, unit = _choose_unit(value, dimension)
     return f"{number} {unit}" if unit else number
 
 
-def span(quantity: Quantity) -> str:
+def format_range(quantity: Quantity) -> str:
     """The range of a quantity, with its unit once where both ends have the same."""
-    low, low_unit = _split(quantity.minimum, quantity.dimension)
-    high, high_unit = _split(quantity.maximum, quantity.dimension)
+    low, low_unit = _choose_unit(quantity.minimum, quantity.dimension)
+    high, high_unit = _choose_unit(quantity.maximum, quantity.dimension)
     if quantity.minimum == 0.0:
         low_unit = high_unit
     if quantity.maximum == 0.0:
@@ -170,7 +172,7 @@ def span(quantity: Quantity) -> str:
     return f"{low} {low_unit} to {high} {high_unit}"
 
 
-def dial_unit(quantity: Quantity) -> str:
+def choose_dial_unit(quantity: Quantity) -> str:
     """The one unit in which all of a quantity's range is shown where a person turns it."""
     dimension = quantity.dimension
     if dimension == "frequency" and quantity.minimum >= 1e5:  # of sound
@@ -183,12 +185,12 @@ def dial_unit(quantity: Quantity) -> str:
     return _ON_A_DIAL.get(dimension, handy)
 
 
-def _split(value: float, dimension: str) -> tuple[str, str]:
+def _choose_unit(value: float, dimension: str) -> tuple[str, str]:
     """The number and the unit that read best of those that say the value exactly."""
     si = Quantity(dimension).unit
     if value == 0.0:
         return "0", _HANDY.get(dimension, (si,))[0]
-    best = _plain(value), si
+    best = _format_number(value), si
     handy = [
         (text, unit)
         for unit in _HANDY.get(dimension, ())
@@ -210,7 +212,7 @@ def _in_unit(value: float, dimension: str, unit: str) -> str | None:
     return _tidy(text) if math.isclose(back, value, rel_tol=_EXACT) else None
 
 
-def _plain(value: float) -> str:
+def _format_number(value: float) -> str:
     text = f"{value:.6g}"
     if float(text) != value:
         text = repr(value)

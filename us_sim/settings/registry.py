@@ -38,9 +38,9 @@ PHANTOMS = Choice(
     "phantom",
     key="phantom",
     error=VolumeError,
-    upper_arm=f"{_PHANTOMS}:upper_arm",
+    upper_arm=f"{_PHANTOMS}:make_upper_arm",
     thrombosed_arm=f"{_PHANTOMS}:thrombosed_arm",
-    drawn_arm=f"{_PHANTOMS}:drawn_arm",
+    drawn_arm=f"{_PHANTOMS}:draw_arm",
 )
 
 PROBES = Choice(

@@ -26,13 +26,13 @@ from typing import Any, ClassVar, Union, get_args, get_origin
 
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.settings.quantity import Quantity
-from us_sim.settings.spelling import shown, unknown
+from us_sim.settings.spelling import describe_unknown, short_repr
 
 NUMBER = Quantity("number")
 
 
 @dataclass(frozen=True)
-class Rule:
+class SettingRule:
     """Properties of a setting beside its name, type and default."""
 
     quantity: Quantity | None = None  # unit and range of a number, or of each number of a list
@@ -67,7 +67,7 @@ def setting(
         default, default_factory, kw_only: as for `dataclasses.field`.
         choices: the only texts that will do.
         choice: the registry that the value is a name in (type ``str``), or that it chooses from
-            (type `Chosen`), or whose names are its keys (type ``dict``).
+            (type `ChosenOption`), or whose names are its keys (type ``dict``).
         place: where the keys of what is chosen stand. ``within`` the mapping under this field's
             name, with the registry's key; ``beside`` the other fields; or ``named``: under a key
             that is the chosen name, beside the other fields.
@@ -76,7 +76,7 @@ def setting(
         applies: the name of another field, and the values of that with which this one means
             something.
     """
-    rule = Rule(quantity, description, tuple(choices), choice, place, file, live, applies)
+    rule = SettingRule(quantity, description, tuple(choices), choice, place, file, live, applies)
     return field(
         default=default, default_factory=default_factory, kw_only=kw_only, metadata={"rule": rule}
     )
@@ -109,17 +109,17 @@ class Settings:
             value = getattr(self, name)
             if value is not _default(type(self), name):
                 try:
-                    value = convert(kinds[name], value, rule)
-                except Refusal as refusal:
-                    raise self.refused(f"{name}{refusal.key}", refusal.problem) from refusal
+                    value = convert_value(kinds[name], value, rule)
+                except RefusedValue as refusal:
+                    raise self.make_error(f"{name}{refusal.key}", refusal.problem) from refusal
                 object.__setattr__(self, name, value)
         for name in rules_of(type(self)):
-            problem = self.inapplicable(name)
+            problem = self.explain_inapplicable(name)
             if problem and getattr(self, name) != _default(type(self), name):
-                raise self.refused(name, problem)
+                raise self.make_error(name, problem)
         self.check()
 
-    def inapplicable(self, name: str) -> str:
+    def explain_inapplicable(self, name: str) -> str:
         """The reason why a setting has no meaning beside another one; "" if it has."""
         applies = rules_of(type(self))[name].applies
         if applies is None:
@@ -137,14 +137,14 @@ class Settings:
     def check(self) -> None:
         """Refuse values that do not go together."""
 
-    def refused(self, key: str, problem: str) -> UsSimError:
+    def make_error(self, key: str, problem: str) -> UsSimError:
         """The error for a wrong value of one of these settings."""
         error = self.error(f"{self.section}.{key}: {problem}" if self.section else problem)
         error.key, error.problem = key, problem
         return error
 
 
-class Refusal(ValueError):
+class RefusedValue(ValueError):
     """A refused value: the rest of the path of keys to it, and the fault."""
 
     def __init__(self, problem: str, key: str = "") -> None:
@@ -152,11 +152,11 @@ class Refusal(ValueError):
         self.key, self.problem = key, problem
 
 
-_rules: dict[type, dict[str, Rule]] = {}
+_rules: dict[type, dict[str, SettingRule]] = {}
 _kinds: dict[type, dict[str, Any]] = {}
 
 
-def rules_of(settings: type) -> dict[str, Rule]:
+def rules_of(settings: type) -> dict[str, SettingRule]:
     """The rules of a dataclass's settings by name, in order; other fields are left out."""
     if settings not in _rules:
         fields = dataclasses.fields(settings)
@@ -176,11 +176,11 @@ def _default(settings: type, name: str) -> Any:
     return settings.__dataclass_fields__[name].default  # type: ignore[attr-defined]
 
 
-Converter = Callable[[Any, Any, Rule], Any]
+Converter = Callable[[Any, Any, SettingRule], Any]
 """Takes the type of a value, the value and the rule of its setting; makes the one of the other."""
 
 
-def convert(kind: Any, value: Any, rule: Rule, other: Converter | None = None) -> Any:
+def convert_value(kind: Any, value: Any, rule: SettingRule, other: Converter | None = None) -> Any:
     """The value as its type and rule say: numbers in SI units, lists as tuples.
 
     Args:
@@ -197,58 +197,58 @@ def convert(kind: Any, value: Any, rule: Rule, other: Converter | None = None) -
         if value is None:
             return None
         options = [option for option in get_args(kind) if option is not type(None)]
-        kind = next((option for option in options if _suits(option, value)), options[0])
+        kind = next((option for option in options if _fits_type(option, value)), options[0])
     if kind in (int, float):
-        return _number(kind, value, rule)
+        return _convert_number(kind, value, rule)
     if kind is bool:
         if not isinstance(value, bool):
-            raise Refusal(f"must be true or false, not {shown(value)}")
+            raise RefusedValue(f"must be true or false, not {short_repr(value)}")
         return value
     if kind is str:
-        return _text(value, rule)
+        return _convert_text(value, rule)
     if get_origin(kind) is tuple:
-        return tuple(_items(get_args(kind), value, rule, other))
+        return tuple(_convert_items(get_args(kind), value, rule, other))
     return value if other is None else other(kind, value, rule)
 
 
-def _number(kind: type, value: Any, rule: Rule) -> float | int:
+def _convert_number(kind: type, value: Any, rule: SettingRule) -> float | int:
     try:
         number = (rule.quantity or NUMBER).parse(value)
     except ValueError as error:
-        raise Refusal(str(error)) from error
+        raise RefusedValue(str(error)) from error
     if kind is int and number != int(number):
-        raise Refusal(f"{shown(value)} is not a whole number")
+        raise RefusedValue(f"{short_repr(value)} is not a whole number")
     return kind(number)  # type: ignore[no-any-return]
 
 
-def _text(value: Any, rule: Rule) -> str:
+def _convert_text(value: Any, rule: SettingRule) -> str:
     if not isinstance(value, str):
-        raise Refusal(f"must be a text, not {shown(value)}")
+        raise RefusedValue(f"must be a text, not {short_repr(value)}")
     choices = rule.choice.names if rule.choice else rule.choices
     if choices and value not in choices:
-        raise Refusal(unknown(value, choices))
+        raise RefusedValue(describe_unknown(value, choices))
     return value
 
 
-def _items(
-    kinds: tuple[Any, ...], value: Any, rule: Rule, other: Converter | None
+def _convert_items(
+    kinds: tuple[Any, ...], value: Any, rule: SettingRule, other: Converter | None
 ) -> Iterator[Any]:
     """The items of a list, each converted; of a fixed number where the type says so."""
     if isinstance(value, str | dict) or not hasattr(value, "__iter__"):
-        raise Refusal(f"must be a list, not {shown(value)}")
+        raise RefusedValue(f"must be a list, not {short_repr(value)}")
     items = list(value)
     if kinds[-1] is Ellipsis:
         kinds = kinds[:1] * len(items)
     if len(items) != len(kinds):
-        raise Refusal(f"needs {len(kinds)} values, not {len(items)}")
+        raise RefusedValue(f"needs {len(kinds)} values, not {len(items)}")
     for i, (kind, item) in enumerate(zip(kinds, items, strict=True)):
         try:
-            yield convert(kind, item, rule, other)
-        except Refusal as refusal:
-            raise Refusal(refusal.problem, f"[{i}]{refusal.key}") from refusal
+            yield convert_value(kind, item, rule, other)
+        except RefusedValue as refusal:
+            raise RefusedValue(refusal.problem, f"[{i}]{refusal.key}") from refusal
 
 
-def _suits(kind: Any, value: object) -> bool:
+def _fits_type(kind: Any, value: object) -> bool:
     """Whether a value looks like one of that type, where several are possible."""
     if isinstance(value, list | tuple):
         return get_origin(kind) is tuple

@@ -1,13 +1,13 @@
 """Names and numbers for a person: suggestions for unknown names, singular and plural, columns.
 
->>> from us_sim.settings.spelling import unknown
->>> unknown("fem_nonlinaer", ["fem", "fem_nonlinear"])
+>>> from us_sim.settings.spelling import describe_unknown
+>>> describe_unknown("fem_nonlinaer", ["fem", "fem_nonlinear"])
 "'fem_nonlinaer' is not one of fem, fem_nonlinear; did you mean 'fem_nonlinear'?"
->>> from us_sim.settings.spelling import counted
->>> counted(1, "place"), counted(0, "place"), counted(2, "is", "are")
+>>> from us_sim.settings.spelling import format_count
+>>> format_count(1, "place"), format_count(0, "place"), format_count(2, "is", "are")
 ('1 place', '0 places', '2 are')
->>> from us_sim.settings.spelling import aligned
->>> aligned([("topic", "count"), ("/tf", "7")])
+>>> from us_sim.settings.spelling import align_columns
+>>> align_columns([("topic", "count"), ("/tf", "7")])
 ['topic  count', '/tf        7']
 """
 
@@ -23,12 +23,12 @@ _repr = reprlib.Repr()
 _repr.maxstring = _repr.maxother = _LONGEST = 60
 
 
-def counted(count: int, one: str, several: str | None = None) -> str:
+def format_count(count: int, one: str, several: str | None = None) -> str:
     """A number with its noun, ``1 frame`` or ``2 frames``; ``several`` where that is no mere s."""
     return f"{count} {one if count == 1 else several or f'{one}s'}"
 
 
-def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list[str]:
+def align_columns(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list[str]:
     """A line for each row, with columns below each other: those of ``left`` flush left."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
@@ -40,23 +40,23 @@ def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list
     ]
 
 
-def shown(value: object) -> str:
+def short_repr(value: object) -> str:
     """A value as a sentence shows it: in one line, and the start only where it is long."""
     text = " ".join(_repr.repr(value).split())
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
-def nearest(name: object, known: Iterable[str]) -> str | None:
+def find_closest(name: object, known: Iterable[str]) -> str | None:
     """The known name that is most like this one, if any is."""
     found = difflib.get_close_matches(str(name), list(known), n=1)
     return found[0] if found else None
 
 
-def unknown(name: object, known: Iterable[str]) -> str:
+def describe_unknown(name: object, known: Iterable[str]) -> str:
     """That a name is not one of those known, and which was probably meant."""
     known = list(known)
-    like = nearest(name, known)
+    like = find_closest(name, known)
     hint = f"; did you mean '{like}'?" if like else ""
     if len(known) > _MANY:
-        return f"{shown(name)} is not known{hint}"
-    return f"{shown(name)} is not one of {', '.join(known)}{hint}"
+        return f"{short_repr(name)} is not known{hint}"
+    return f"{short_repr(name)} is not one of {', '.join(known)}{hint}"

@@ -37,13 +37,13 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.collider_distance import (
-    offset_box_distance,
-    rotate,
-    rotate_back,
-    signed_distance,
+    measure_box_distance,
+    measure_distances,
+    rotate_vector,
+    rotate_vector_back,
 )
-from us_sim.geometry.pose import Pose, same_pose
-from us_sim.geometry.triangles import TriangleParts, part_size, vertex_normals
+from us_sim.geometry.pose import Pose, is_same_pose
+from us_sim.geometry.triangles import TriangleParts, choose_part_size, compute_vertex_normals
 from us_sim.kernels import njit
 from us_sim.skin.settings import MembraneSettings
 from us_sim.skin.surface import TriangleSurface
@@ -165,9 +165,9 @@ def _place(start, end, fraction):
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _distance(box, r, a, b, c):
     """Distance (m) and the collider's normal at a place (a, b, c) m from the probe's origin."""
-    x, y, z = rotate_back(r, a, b, c)
-    distance, nx, ny, nz = offset_box_distance(box, x, y, z)
-    nx, ny, nz = rotate(r, nx, ny, nz)
+    x, y, z = rotate_vector_back(r, a, b, c)
+    distance, nx, ny, nz = measure_box_distance(box, x, y, z)
+    nx, ny, nz = rotate_vector(r, nx, ny, nz)
     return distance, nx, ny, nz
 
 
@@ -267,7 +267,9 @@ class SkinMembrane:
         corners = surface.vertices[triangles]
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
         rounding = float(collider.offset_box[3])
-        parts = TriangleParts(sides.max(axis=1), part_size(rounding, float(np.median(sides))))
+        parts = TriangleParts(
+            sides.max(axis=1), choose_part_size(rounding, float(np.median(sides)))
+        )
         self._parts = PartArrays(triangles.astype(np.uint32), parts.first, parts.weights)
 
         valence = np.bincount(surface.edges.ravel(), minlength=len(surface.vertices))
@@ -288,7 +290,7 @@ class SkinMembrane:
                 f"stable only up to {self.step_limit:.2g} s without"
             )
         self._at_rest = SkinDeformation(
-            surface.vertices, vertex_normals(surface.vertices, surface.triangles), 0.0, ""
+            surface.vertices, compute_vertex_normals(surface.vertices, surface.triangles), 0.0, ""
         )
         self.reset()
 
@@ -321,7 +323,7 @@ class SkinMembrane:
 
         With an unmoved probe and a settled membrane, this is the latest result unchanged.
         """
-        if self._settled and same_pose(pose, self._pose):
+        if self._settled and is_same_pose(pose, self._pose):
             return self._latest
         start, steps, note = self._approach(pose)
         vertices, velocity = self._vertices.copy(), self._velocity.copy()
@@ -354,7 +356,7 @@ class SkinMembrane:
             return self._latest
         self._latest = SkinDeformation(
             vertices,
-            vertex_normals(vertices, self.surface.triangles),
+            compute_vertex_normals(vertices, self.surface.triangles),
             float(residual),
             "; ".join(part for part in (self._scaling, note) if part),
         )
@@ -370,7 +372,7 @@ class SkinMembrane:
             return None, self._steps, ""
         start = self._pose
         if start is None or np.linalg.norm(pose.position - start.position) > _JUMP:
-            start = self._lifted(pose)
+            start = self._lift(pose)
         box = self._collider.offset_box
         turn = 2.0 * math.acos(min(1.0, abs(float(pose.orientation @ start.orientation))))
         reach = math.hypot(box[0], box[1], 2 * box[2]) + 2 * box[3]
@@ -381,11 +383,11 @@ class SkinMembrane:
             return start, steps, ""
         return start, steps, f"{steps} steps for a probe that moved {1e3 * travel:.3g} mm"
 
-    def _lifted(self, pose: Pose) -> Pose:
+    def _lift(self, pose: Pose) -> Pose:
         axis = pose.rotation[:, 2]
         for lift in np.arange(0.0, 0.1, 2.5e-3):
             lifted = Pose(pose.position - lift * axis, pose.orientation)
-            distance, _ = signed_distance(self._collider, lifted, self._vertices)
+            distance, _ = measure_distances(self._collider, lifted, self._vertices)
             if distance.min() >= 0.0:
                 break
         return lifted

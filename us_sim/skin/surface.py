@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
 from us_sim.geometry.mesh_file import read_with_meshio
-from us_sim.settings.spelling import shown
+from us_sim.settings.spelling import short_repr
 
 _CORNERS = {"triangle": 3, "quad": 4}
 
@@ -214,7 +214,9 @@ def parse_wavefront(text: str) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
                     raise ValueError("a face has three vertices or more")
                 triangles += [(face[0], b, c) for b, c in pairwise(face[1:])]
         except ValueError as error:
-            raise MeshError(f"line {number}: {shown(line.strip())}: {str(error)[:100]}") from error
+            raise MeshError(
+                f"line {number}: {short_repr(line.strip())}: {str(error)[:100]}"
+            ) from error
     return (
         np.array(points, dtype=np.float64).reshape(-1, 3),
         np.array(triangles, dtype=np.int32).reshape(-1, 3),

@@ -1,13 +1,13 @@
 """The scanner as a whole: it shows a volume through a probe, with deformed tissue or without.
 
->>> from us_sim.scene.building import probe_of, volume_of
+>>> from us_sim.scene.building import build_probe, load_volume
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.scene.reading import parse_scene
 >>> from us_sim.slicing.b_mode import BMode
 >>> scene = parse_scene({"name": "bare", "volume": {"phantom": "upper_arm", "voxel_size": "1 mm"},
 ...                      "probe": {"aperture": "4 cm", "depth": "3 cm", "image": [40, 30]}})
->>> scanner = BMode(volume_of(scene), probe_of(scene))
->>> scanner.image(Pose([0, 0, 0.002])).shape
+>>> scanner = BMode(load_volume(scene), build_probe(scene))
+>>> scanner.render_image(Pose([0, 0, 0.002])).shape
 (30, 40)
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import MeshError
-from us_sim.geometry.mesh_faces import boundary_triangles
+from us_sim.geometry.mesh_faces import find_boundary_triangles
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting.slicer import Slicer, create_slicer, warm_up
 from us_sim.slicing.formation.image_formation import ImageFormation
@@ -67,7 +67,7 @@ class BMode:
         self._skin: ContactSurface | None = None
         self._acoustics: BeamAcoustics | None = None
         self._prepared: tuple[Probe, Acoustics, BeamAcoustics] | None = None
-        self.use(probe, imaging or Imaging(), acoustics)
+        self.apply_settings(probe, imaging or Imaging(), acoustics)
 
     @property
     def probe(self) -> Probe:
@@ -79,7 +79,9 @@ class BMode:
         """Inverted or flat tetrahedra that the latest slice left out."""
         return self._slicer.skipped if self._slicer else 0
 
-    def use(self, probe: Probe, imaging: Imaging, acoustics: Acoustics | None = None) -> None:
+    def apply_settings(
+        self, probe: Probe, imaging: Imaging, acoustics: Acoustics | None = None
+    ) -> None:
         """Use another probe, or other settings, from the next image on.
 
         Raises:
@@ -87,13 +89,15 @@ class BMode:
         """
         self._acoustics = self._acoustics_of(probe, acoustics)
         if self._acoustics is not None:
-            imaging = self._acoustics.resolved(imaging)
+            imaging = self._acoustics.resolve_imaging(imaging)
             if self._mesh is not None:
-                self._acoustics.carry(*self._mesh)
+                self._acoustics.attach_mesh(*self._mesh)
         self._probe = probe
         self._formation = ImageFormation(probe, imaging)
 
-    def prepare(self, probe: Probe, imaging: Imaging, acoustics: Acoustics | None = None) -> None:
+    def prepare_settings(
+        self, probe: Probe, imaging: Imaging, acoustics: Acoustics | None = None
+    ) -> None:
         """Load everything for images with these settings, so that the first is not late.
 
         Raises:
@@ -104,17 +108,17 @@ class BMode:
         if live is not None and acoustics is not None:
             live.warm_up()
             self._prepared = probe, acoustics, live
-            imaging = live.resolved(imaging)
+            imaging = live.resolve_imaging(imaging)
         formation = ImageFormation(probe, imaging)
         blank = np.zeros((probe.rows, probe.columns), dtype=np.uint8)
-        blanks = [blank for _ in formation.planes(Pose())]
+        blanks = [blank for _ in formation.make_planes(Pose())]
         if not formation.needs_contact:
-            formation.form(blanks)
+            formation.form_picture(blanks)
             return
         surface = self._contact_surface(deformed=False)
-        formation.form(blanks, *surface.contact(surface.rest_nodes, probe, Pose()))
+        formation.form_picture(blanks, *surface.measure_contact(surface.rest_nodes, probe, Pose()))
 
-    def carry(self, rest_nodes: ArrayLike, tetrahedra: ArrayLike) -> None:
+    def attach_mesh(self, rest_nodes: ArrayLike, tetrahedra: ArrayLike) -> None:
         """Let this mesh carry the volume: (N, 3) m at rest, and (M, 4) indices into them.
 
         Raises:
@@ -129,9 +133,9 @@ class BMode:
         self._mesh = np.asarray(rest_nodes, dtype=np.float64), np.asarray(tetrahedra, np.int32)
         self._surface = None
         if self._acoustics is not None:
-            self._acoustics.carry(*self._mesh)
+            self._acoustics.attach_mesh(*self._mesh)
 
-    def touch(self, vertices: ArrayLike, triangles: ArrayLike) -> None:
+    def attach_skin(self, vertices: ArrayLike, triangles: ArrayLike) -> None:
         """Let the face touch this skin, in frames that know where it lies.
 
         Args:
@@ -146,7 +150,7 @@ class BMode:
 
         self._skin = ContactSurface(vertices, triangles, is_outward=True)
 
-    def frame(
+    def make_frame(
         self,
         pose: Pose,
         nodes: NDArray[np.float64] | None = None,
@@ -160,7 +164,7 @@ class BMode:
         Args:
             nodes: (N, 3) m, where the carrying mesh is; None for the volume as it is. Kept, not
                 copied.
-            skin: (V, 3) m, where the vertices given to `touch` are.
+            skin: (V, 3) m, where the vertices given to `attach_skin` are.
             time: s since 1970, of the pose.
         """
         touches = self._formation.needs_contact
@@ -181,7 +185,9 @@ class BMode:
             threads=self._threads,
         )
 
-    def image(self, pose: Pose, nodes: NDArray[np.float64] | None = None) -> NDArray[np.uint8]:
+    def render_image(
+        self, pose: Pose, nodes: NDArray[np.float64] | None = None
+    ) -> NDArray[np.uint8]:
         """The B-mode image (rows, columns) with the probe at ``pose``: `Frame.pixels`.
 
         Args:
@@ -190,17 +196,19 @@ class BMode:
         Raises:
             MeshError, ProbeError, VolumeError: as for `Frame`.
         """
-        return self.frame(pose, nodes).pixels
+        return self.make_frame(pose, nodes).pixels
 
-    def labels(self, pose: Pose, nodes: NDArray[np.float64] | None = None) -> NDArray[np.uint8]:
+    def render_labels(
+        self, pose: Pose, nodes: NDArray[np.float64] | None = None
+    ) -> NDArray[np.uint8]:
         """The volume's label at each pixel (rows, columns), 0 where there is nothing.
 
         Raises:
-            MeshError, ProbeError, VolumeError: as for `Frame.labels`.
+            MeshError, ProbeError, VolumeError: as for `Frame.render_labels`.
         """
-        return self.frame(pose, nodes).labels
+        return self.make_frame(pose, nodes).labels
 
-    def beyond(self, pose: Pose, *, pressed: bool = True) -> float:
+    def measure_excess_depth(self, pose: Pose, *, pressed: bool = True) -> float:
         """m by which the middle beam reaches beyond the mesh at rest, or the volume without one.
 
         Args:
@@ -210,7 +218,9 @@ class BMode:
         extent = self._volume.extent
         if self._mesh is not None:
             extent = np.stack([self._mesh[0].min(axis=0), self._mesh[0].max(axis=0)])
-        return beyond(self._probe, pose, extent, pressed=pressed or self._mesh is None)
+        return measure_excess_depth(
+            self._probe, pose, extent, pressed=pressed or self._mesh is None
+        )
 
     def _acoustics_of(self, probe: Probe, acoustics: Acoustics | None) -> BeamAcoustics | None:
         if acoustics is None or not acoustics.is_live:
@@ -229,7 +239,7 @@ class BMode:
             if not deformed or self._mesh is None:
                 return ContactSurface(*_outer_box(self._volume))
             rest_nodes, tetrahedra = self._mesh
-            self._surface = ContactSurface(rest_nodes, boundary_triangles(tetrahedra))
+            self._surface = ContactSurface(rest_nodes, find_boundary_triangles(tetrahedra))
         return self._surface
 
 
@@ -244,7 +254,9 @@ def _outer_box(volume: Volume) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     return index @ to_patient[:3, :3].T + to_patient[:3, 3], np.array(triangles, dtype=np.int32)
 
 
-def beyond(probe: Probe, pose: Pose, extent: NDArray[np.float64], *, pressed: bool = True) -> float:
+def measure_excess_depth(
+    probe: Probe, pose: Pose, extent: NDArray[np.float64], *, pressed: bool = True
+) -> float:
     """m of the middle beam that lie behind a box; 0 where it ends within it or never enters it.
 
     Args:

@@ -13,8 +13,8 @@ from us_sim.errors import MeshError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting.resampling import (
     BLACK,
-    Located,
-    pixel_to_index,
+    LocatedPixels,
+    compute_pixel_to_index,
     sample_labels,
     sample_plane,
 )
@@ -34,7 +34,7 @@ Mesh = tuple[NDArray[np.float64], NDArray[np.int32]]
 class Sound(Protocol):
     """What beams meet on their way, such as `BeamAcoustics`."""
 
-    def heard(self, image: NDArray[np.uint8], frame: Frame) -> NDArray[np.uint8]:
+    def apply_acoustics(self, image: NDArray[np.uint8], frame: Frame) -> NDArray[np.uint8]:
         """Return the image as its beams bring it."""
 
 
@@ -68,17 +68,21 @@ class Frame:
     @cached_property
     def plane(self) -> SlicePlane:
         """The grid of the pixels."""
-        return self.probe.plane(self.pose)
+        return self.probe.make_plane(self.pose)
 
     @cached_property
     def pixels(self) -> NDArray[np.uint8]:
         """The B-mode picture (rows, columns)."""
         if self.formation is None:
-            return self.slice(self.plane)
-        slices = [self.slice(plane) for plane in self.formation.planes(self.pose, self.plane)]
-        heard = None if self.acoustics is None else partial(self.acoustics.heard, frame=self)
+            return self.sample_plane(self.plane)
+        slices = [
+            self.sample_plane(plane) for plane in self.formation.make_planes(self.pose, self.plane)
+        ]
+        heard = (
+            None if self.acoustics is None else partial(self.acoustics.apply_acoustics, frame=self)
+        )
         coupling, gap = self.contact or (None, None)
-        return self.formation.form(slices, coupling, gap, heard)
+        return self.formation.form_picture(slices, coupling, gap, heard)
 
     @cached_property
     def contact(self) -> Contact | None:
@@ -89,9 +93,9 @@ class Frame:
         if self.surface is None:
             return None
         where = self.surface.rest_nodes if self.nodes is None else self.nodes
-        coupling, gap = self.surface.contact(where, self.probe, self.pose)
+        coupling, gap = self.surface.measure_contact(where, self.probe, self.pose)
         if self.skin_surface is not None and self.skin is not None:
-            coupling, _ = self.skin_surface.contact(self.skin, self.probe, self.pose)
+            coupling, _ = self.skin_surface.measure_contact(self.skin, self.probe, self.pose)
         return coupling, gap
 
     @cached_property
@@ -103,10 +107,10 @@ class Frame:
         """
         if self.nodes is None or self.slicer is None:
             return sample_labels(self.volume, self.plane, threads=self.threads)
-        return self.slicer.labels_at(self.located)
+        return self.slicer.sample_located_labels(self.located)
 
     @cached_property
-    def located(self) -> Located:
+    def located(self) -> LocatedPixels:
         """Where each pixel lies in the mesh.
 
         Raises:
@@ -114,28 +118,30 @@ class Frame:
         """
         if self.nodes is None or self.slicer is None:
             raise MeshError("no tissue carries the volume, so no pixel lies in its mesh")
-        return self.slicer.locate(self.nodes, self.plane)
+        return self.slicer.locate_pixels(self.nodes, self.plane)
 
     @property
-    def placed(self) -> Located:
+    def placed(self) -> LocatedPixels:
         """Where each pixel lies in the mesh, or in the volume as it is."""
         return self._rigid if self.nodes is None or self.slicer is None else self.located
 
     @cached_property
-    def _rigid(self) -> Located:
+    def _rigid(self) -> LocatedPixels:
         plane = self.plane
         elements = np.zeros((plane.rows, plane.columns), dtype=np.int32)
-        elements[~plane.is_shown()] = BLACK
-        return Located(elements, pixel_to_index(self.volume, plane)[None], np.empty(0, np.intp))
+        elements[~plane.make_shown_mask()] = BLACK
+        return LocatedPixels(
+            elements, compute_pixel_to_index(self.volume, plane)[None], np.empty(0, np.intp)
+        )
 
-    def locate_some(self, steps: tuple[int, int]) -> Located:
-        """Where every so many-th row and column lies in the mesh, see `Slicer.locate_some`."""
+    def locate_pixel_subset(self, steps: tuple[int, int]) -> LocatedPixels:
+        """Where every so many-th row and column lies in the mesh, see `Slicer.locate_pixel_subset`."""
         if self.nodes is None or self.slicer is None or "located" in self.__dict__:
-            return self.located.some(steps)
-        return self.slicer.locate_some(self.nodes, self.plane, steps)
+            return self.located.take_every(steps)
+        return self.slicer.locate_pixel_subset(self.nodes, self.plane, steps)
 
-    def slice(self, plane: SlicePlane) -> NDArray[np.uint8]:
+    def sample_plane(self, plane: SlicePlane) -> NDArray[np.uint8]:
         """The volume's grey values (rows, columns) on a plane, as the tissue carries them now."""
         if self.nodes is None or self.slicer is None:
             return sample_plane(self.volume, plane, threads=self.threads)
-        return self.slicer.image(self.nodes, plane)
+        return self.slicer.cut_image(self.nodes, plane)

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.slicing.drawing.overlay import Colour, lettering
-from us_sim.slicing.probe.beams import pixels_of
+from us_sim.slicing.drawing.overlay import Colour, render_text
+from us_sim.slicing.probe.beams import convert_to_pixels
 from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.settings import MModeSettings
 
@@ -43,26 +43,26 @@ class SweepPicture:
         cv2.line(self._frame, (columns, 0), (columns, rows), _LINE, 1)
         cv2.line(self._frame, (0, rows), (columns, rows), _LINE, 1)
         self._marks: list[int] = []
-        for value in _round_numbers(min(top, bottom), max(top, bottom)):
+        for value in _choose_tick_values(min(top, bottom), max(top, bottom)):
             row = round((value - top) / (bottom - top) * rows - 0.5)
             text = f"{value:g} {unit}" if value == 0 else f"{value:g}"
-            label = lettering(text, _TEXT, _SCALE)
+            label = render_text(text, _TEXT, _SCALE)
             place = int(np.clip(row - label.height // 2, 0, rows - label.height))
             cv2.line(self._frame, (columns, row), (columns + 4, row), _SCALE, 1)
-            label.draw(self._frame, columns + 7, place)
+            label.draw_at(self._frame, columns + 7, place)
             self._marks += [row] if value == 0.0 and 0 < row < rows - 1 else []
-        for value in _round_numbers(-sweep, 0.0):
+        for value in _choose_tick_values(-sweep, 0.0):
             column = columns - 1 + round(value / self._duration)
-            label = lettering(f"{value:g} s" if value == 0 else f"{value:g}", _TEXT, _SCALE)
+            label = render_text(f"{value:g} s" if value == 0 else f"{value:g}", _TEXT, _SCALE)
             cv2.line(self._frame, (column, rows), (column, rows + 4), _SCALE, 1)
-            label.draw(self._frame, max(0, column - label.width // 2), rows + 6)
+            label.draw_at(self._frame, max(0, column - label.width // 2), rows + 6)
 
     @property
     def grey(self) -> NDArray[np.uint8]:
         """(rows, columns) without the scales; the newest column is the last."""
         return self._grey
 
-    def moments(self, time: float) -> NDArray[np.float64]:
+    def advance_to(self, time: float) -> NDArray[np.float64]:
         """The times (K,) s of the columns to be added now, up to ``time``.
 
         After time went back, or stood still for longer than the picture, it begins anew.
@@ -76,14 +76,14 @@ class SweepPicture:
         self._last = newest
         return np.asarray(numbers * self._duration, dtype=np.float64)
 
-    def add(self, columns: NDArray[np.uint8]) -> None:
+    def append_columns(self, columns: NDArray[np.uint8]) -> None:
         """Move the picture to the left and put these columns (rows, K) on its right."""
         count = columns.shape[1]
         if count:
             self._grey[:, :-count] = self._grey[:, count:]
             self._grey[:, -count:] = columns
 
-    def drawn(self) -> NDArray[np.uint8]:
+    def draw_picture(self) -> NDArray[np.uint8]:
         """A new picture of red, green and blue, with its scales."""
         rows, columns = self._grey.shape
         picture = self._frame.copy()
@@ -93,7 +93,7 @@ class SweepPicture:
         return picture
 
 
-def _round_numbers(low: float, high: float) -> list[float]:
+def _choose_tick_values(low: float, high: float) -> list[float]:
     """Multiples of 1, 2 or 5 times a power of ten in that range, ends included; a few of them."""
     rough = (high - low) / _MOST
     power = 10.0 ** math.floor(math.log10(rough))
@@ -111,7 +111,7 @@ class MMode:
     def __init__(self, probe: Probe, settings: MModeSettings) -> None:
         self.settings = settings
         depth = (np.arange(_ROWS) + 0.5) * (probe.depth / _ROWS)
-        places = pixels_of(probe, np.full(_ROWS, settings.lateral), depth)
+        places = convert_to_pixels(probe, np.full(_ROWS, settings.lateral), depth)
         #: (2, 2) column and row of the ends of the line.
         self.places = places[[0, -1]]
         column, row = places.astype(np.float32).T
@@ -120,22 +120,22 @@ class MMode:
             _ROWS, _COLUMNS, settings.sweep, (0.0, 1e3 * probe.depth, "mm")
         )
 
-    def go_on(self, before: MMode) -> None:
+    def take_over_picture(self, before: MMode) -> None:
         """Go on with the picture of a line that looked elsewhere, if its scales are the same."""
         if before._picture.layout == self._picture.layout:
             self._picture = before._picture
 
-    def line(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def sample_line(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Grey values (rows,) along the line of an image (rows, columns), from the face down."""
         linear, edge = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
         line = cv2.remap(image, self._column, self._row, linear, borderMode=edge)
         return np.asarray(line, dtype=np.uint8)[:, 0]
 
-    def show(self, image: NDArray[np.uint8], time: float) -> NDArray[np.uint8]:
+    def draw_sweep(self, image: NDArray[np.uint8], time: float) -> NDArray[np.uint8]:
         """The picture (rows, columns, 3) up to the image at a time (s), with its scales.
 
         Between two images it shows the later one.
         """
-        count = len(self._picture.moments(time))
-        self._picture.add(np.repeat(self.line(image)[:, None], count, axis=1))
-        return self._picture.drawn()
+        count = len(self._picture.advance_to(time))
+        self._picture.append_columns(np.repeat(self.sample_line(image)[:, None], count, axis=1))
+        return self._picture.draw_picture()

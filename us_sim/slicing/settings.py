@@ -133,7 +133,7 @@ _LENGTH = Quantity("length", 0.2e-3, 0.05)
 
 
 @dataclass(frozen=True)
-class Strain(Settings):
+class StrainSettings(Settings):
     """Strain images: the tissue's own, and an estimate made from two images as a scanner makes it.
 
     Raises:
@@ -271,16 +271,16 @@ class FlowSettings(Settings):
     def check(self) -> None:
         """Refuse velocities, pressures and a direction that cannot be."""
         if math.hypot(*self.direction) < 1e-3:
-            raise self.refused("direction", "has no length: give where the blood flows")
+            raise self.make_error("direction", "has no length: give where the blood flows")
         if self.peak_velocity < 2.0 * self.mean_velocity:
-            raise self.refused(
+            raise self.make_error(
                 "peak_velocity",
                 f"{self.peak_velocity:g} m/s is less than twice mean_velocity, "
                 f"{self.mean_velocity:g} m/s: on the axis of a vessel blood flows twice as fast as "
                 f"in its mean",
             )
         if self.kind == "venous" and self.bed_pressure <= self.pressure_at_rest:
-            raise self.refused(
+            raise self.make_error(
                 "bed_pressure",
                 f"{self.bed_pressure:g} Pa is not above the {self.pressure_at_rest:g} Pa in the "
                 f"vein, so nothing would flow into it",
@@ -332,7 +332,7 @@ class DopplerSettings(Settings):
     def check(self) -> None:
         """Refuse a wall filter that leaves nothing."""
         if self.wall_filter >= self.nyquist_velocity:
-            raise self.refused(
+            raise self.make_error(
                 "wall_filter",
                 f"{self.wall_filter:g} m/s is not below nyquist_velocity, "
                 f"{self.nyquist_velocity:g} m/s: nothing would be left to show",

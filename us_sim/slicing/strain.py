@@ -19,7 +19,7 @@ volumes (Zienkiewicz and Zhu, Int. J. Numer. Methods Eng. 24:337, 1987), and lin
 >>> scanner = BMode(volume, LinearProbe(aperture=0.01, depth=0.02, columns=2, rows=3))
 >>> scanner.carry(mesh.nodes, mesh.tetrahedra)
 >>> frame = scanner.frame(Pose([0.02, 0.02, 0.01]), mesh.nodes * [1.02, 1.02, 0.95])
->>> AxialStrain.of(frame).image(frame)[:, 0].round(4)
+>>> AxialStrain.of(frame).compute_strain(frame)[:, 0].round(4)
 array([-0.05, -0.05, -0.05], dtype=float32)
 """
 
@@ -32,14 +32,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import MeshError
 from us_sim.kernels import njit
-from us_sim.slicing.cutting.resampling import evaluate, parallel_rows
-from us_sim.slicing.cutting.section import adjugate, is_solid
+from us_sim.slicing.cutting.resampling import evaluate_affine, run_rows_in_parallel
+from us_sim.slicing.cutting.section import compute_adjugate, is_solid
 from us_sim.slicing.drawing.overlay import ColourScale
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import LinearProbe, Probe
 
 
-def displacement(frame: Frame) -> NDArray[np.float32]:
+def compute_displacement(frame: Frame) -> NDArray[np.float32]:
     """(rows, columns, 2) m: the tissue's way from rest to each pixel, lateral and axial.
 
     These are its components along +x and +z of frame ``probe`` as the probe is now; the part across
@@ -58,11 +58,11 @@ def displacement(frame: Frame) -> NDArray[np.float32]:
     rest = to_patient[:3, :3] @ located.maps[: len(located.tetrahedra)]
     rest[:, :, 0] += to_patient[:3, 3]
     across = frame.pose.rotation[:, [0, 2]].T
-    return evaluate(across @ (now - rest), located.elements, threads=frame.threads)
+    return evaluate_affine(across @ (now - rest), located.elements, threads=frame.threads)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def nodal_deformation(
+def fill_nodal_deformation(
     shown, tetrahedra, starts, members, before, now, to_pixel, pixel_volume, steps, place, deformed,
     done, mean,
 ):  # fmt: skip
@@ -115,7 +115,7 @@ def nodal_deformation(
 def _deform(tetrahedra, e, before, place, pixel_volume, steps, deformed):
     """Fills a tetrahedron's row: its volume now in any unit (0 if it is not solid), and c."""
     n0, n1, n2, n3 = tetrahedra[e, 0], tetrahedra[e, 1], tetrahedra[e, 2], tetrahedra[e, 3]
-    size, to_1, to_2, to_3 = adjugate(place, n0, n1, n2, n3)
+    size, to_1, to_2, to_3 = compute_adjugate(place, n0, n1, n2, n3)
     ax = before[n1, 0] - before[n0, 0]
     ay = before[n1, 1] - before[n0, 1]
     az = before[n1, 2] - before[n0, 2]
@@ -145,18 +145,18 @@ def _deform(tetrahedra, e, before, place, pixel_volume, steps, deformed):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def to_pixels(shown, tetrahedra, place, mean, maps):
+def fill_pixel_maps(shown, tetrahedra, place, mean, maps):
     """Fills ``maps`` (E, 3, 3): coefficients of (1, column, row) of the nodes' values.
 
     Args:
         shown: (E,) numbers of tetrahedra. tetrahedra: (M, 4) nodes.
         place: (N, 3) column, row and height of the nodes.
-        mean: (N, 3), as `nodal_deformation` fills it.
+        mean: (N, 3), as `fill_nodal_deformation` fills it.
     """
     for s in range(len(shown)):
         e = shown[s]
         n0, n1, n2, n3 = tetrahedra[e, 0], tetrahedra[e, 1], tetrahedra[e, 2], tetrahedra[e, 3]
-        size, to_1, to_2, to_3 = adjugate(place, n0, n1, n2, n3)
+        size, to_1, to_2, to_3 = compute_adjugate(place, n0, n1, n2, n3)
         r = 1.0 / size
         for k in range(3):
             at = mean[n0, k]
@@ -190,7 +190,7 @@ class AxialStrain:
         self._directions: tuple[Probe, NDArray[np.float32]] | None = None
 
     @classmethod
-    def of(cls, frame: Frame) -> AxialStrain:
+    def from_frame(cls, frame: Frame) -> AxialStrain:
         """The strain of the mesh that carries the volume in a frame.
 
         Raises:
@@ -200,7 +200,9 @@ class AxialStrain:
             raise MeshError("no tissue carries the volume, so there is no strain")
         return cls(*frame.mesh)
 
-    def image(self, frame: Frame, before: NDArray[np.float64] | None = None) -> NDArray[np.float32]:
+    def compute_strain(
+        self, frame: Frame, before: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float32]:
         """(rows, columns): the strain along each pixel's beam, negative where tissue got shorter.
 
         Args:
@@ -215,26 +217,26 @@ class AxialStrain:
             ProbeError: the pose is nowhere near.
         """
         located, plane = frame.located, frame.plane
-        now = self._as_kernels_take(frame.nodes, self._now)
-        then = self._rest if before is None else self._as_kernels_take(before, self._before)
+        now = self._copy_nodes(frame.nodes, self._now)
+        then = self._rest if before is None else self._copy_nodes(before, self._before)
         shown = located.tetrahedra
-        nodal_deformation(
+        fill_nodal_deformation(
             shown, self._tetrahedra, self._starts, self._members, then, now, plane.to_pixel,
             float(np.linalg.det(plane.basis)), frame.probe.pixel_spacing, self._place,
             self._deformed, self._done, self._mean,
         )  # fmt: skip
         maps = np.empty((len(shown), 3, 3))
-        to_pixels(shown, self._tetrahedra, self._place, self._mean, maps)
+        fill_pixel_maps(shown, self._tetrahedra, self._place, self._mean, maps)
         values = np.empty(located.elements.shape, dtype=np.float32)
         elements, directions = located.elements, self._directions_of(frame.probe)
-        parallel_rows(
+        run_rows_in_parallel(
             frame.threads,
             plane.rows,
             lambda first, end: _strain(maps, elements, directions, first, end, values),
         )
         return values
 
-    def _as_kernels_take(self, nodes: ArrayLike | None, room: NDArray[np.float64]) -> Any:
+    def _copy_nodes(self, nodes: ArrayLike | None, room: NDArray[np.float64]) -> Any:
         array = np.asarray(nodes)
         if array.shape != room.shape:
             raise MeshError(
@@ -258,7 +260,7 @@ def _strain(maps, elements, directions, first_row, end_row, values):
     """Fills rows of ``values`` (rows, columns) a run of pixels of one tetrahedron at a time.
 
     Args:
-        maps: (E, 3, 3) as `to_pixels` fills them. elements: (rows, columns).
+        maps: (E, 3, 3) as `fill_pixel_maps` fills them. elements: (rows, columns).
         directions: (2, rows, columns) x and z of each pixel's beam, or (2, 1, 1) for 0 and 1.
     """
     columns = elements.shape[1]
@@ -300,7 +302,7 @@ def _strain(maps, elements, directions, first_row, end_row, values):
             start = end
 
 
-class Compression(NamedTuple):
+class ImageCompression(NamedTuple):
     """Mean strain and evenness of all tissue in a strain image."""
 
     mean: float  # strain, negative where the tissue got shorter; 0 without tissue
@@ -314,13 +316,13 @@ class Compression(NamedTuple):
     """
 
 
-def compression(strain: NDArray[np.floating]) -> Compression:
+def measure_compression(strain: NDArray[np.floating]) -> ImageCompression:
     """The compression of an image (any shape) of strain, NaN where there is no tissue."""
     there = strain[np.isfinite(strain)].astype(np.float64)
     if not there.size:
-        return Compression(0.0, 0.0)
+        return ImageCompression(0.0, 0.0)
     mean, square = float(there.mean()), float(np.square(there).mean())
-    return Compression(mean, abs(mean) / square**0.5 if square > 0.0 else 0.0)
+    return ImageCompression(mean, abs(mean) / square**0.5 if square > 0.0 else 0.0)
 
 
 _COLOURS = ((215, 48, 39), (253, 174, 97), (48, 48, 48), (116, 173, 209), (69, 117, 180))
@@ -331,13 +333,13 @@ _STAYS = 0.4  # the bar's end stays until strain is less than this much of it
 _STEP = 4  # pixels from one that is looked at to the next
 
 
-class FollowingEnd:
+class AdaptiveScale:
     """The strain at the ends of a bar that holds nearly all of an image, and seldom changes."""
 
     def __init__(self) -> None:
         self._end = 0.0
 
-    def of(self, values: NDArray[np.floating]) -> float:
+    def update_end(self, values: NDArray[np.floating]) -> float:
         """The end for an image (rows, columns), NaN where there is no strain."""
         sizes = np.abs(values[::_STEP, ::_STEP])
         sizes = sizes[np.isfinite(sizes)]
@@ -347,7 +349,7 @@ class FollowingEnd:
         return self._end
 
 
-def strain_scale(name: str, most: float) -> ColourScale:
+def make_strain_scale(name: str, most: float) -> ColourScale:
     """Colours from -most to most, in percent; red and blue differ to colour-blind eyes, too."""
     title = name.replace("_", " ")
     return ColourScale(title, -most, most, "%", factor=100.0, colours=_COLOURS)

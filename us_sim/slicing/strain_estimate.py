@@ -9,11 +9,11 @@ displacement (Kallel and Ophir, Ultrasonic Imaging 19:195, 1997).
 
 >>> import numpy as np
 >>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.slicing.settings import Strain
+>>> from us_sim.slicing.settings import StrainSettings
 >>> from us_sim.slicing.strain_estimate import estimate_strain
 >>> probe = LinearProbe(aperture=0.02, depth=0.03, columns=100, rows=300, lines=100, samples=300)
 >>> speckle = np.random.default_rng(0).integers(0, 256, (300, 100)).astype(np.uint8)
->>> same = estimate_strain(speckle, speckle, probe, Strain())
+>>> same = estimate_strain(speckle, speckle, probe, StrainSettings())
 >>> float(abs(np.nan_to_num(same.strain)).max()) < 2e-3, round(same.correlation, 3)
 (True, 1.0)
 """
@@ -35,12 +35,12 @@ from us_sim.kernels import njit
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import LinearProbe, Probe
-from us_sim.slicing.settings import Strain
-from us_sim.slicing.strain import AxialStrain, displacement
+from us_sim.slicing.settings import StrainSettings
+from us_sim.slicing.strain import AxialStrain, compute_displacement
 from us_sim.volume.volume import Volume
 
 
-def slope(values: ArrayLike, weight: ArrayLike, length: int) -> NDArray[np.float32]:
+def fit_slopes(values: ArrayLike, weight: ArrayLike, length: int) -> NDArray[np.float32]:
     """The slope (per sample) at each sample of (samples, lines) values, down the columns.
 
     Args:
@@ -79,7 +79,7 @@ Window = tuple[Field, Field, Field]
 """An image, and the mean and standard deviation around each of its samples."""
 
 
-def track(
+def track_displacement(
     earlier: ArrayLike, later: ArrayLike, *, window: tuple[int, int], search: int
 ) -> tuple[Field, Field]:
     """Displacement of each sample of the later image along its beam, in samples.
@@ -227,7 +227,7 @@ def _smoothed(moved: Field, correlation: Field, size: tuple[int, int]) -> Field:
 _STEEPEST = 0.5  # of displacement along a beam: what is found steeper than that is not tissue
 
 
-class Estimate(NamedTuple):
+class StrainEstimate(NamedTuple):
     """An estimate of strain between two images."""
 
     strain: NDArray[np.float32]  # (rows, columns), defined as `AxialStrain`'s; NaN where not found
@@ -241,8 +241,8 @@ class Estimate(NamedTuple):
 
 
 def estimate_strain(
-    earlier: NDArray[np.uint8], later: NDArray[np.uint8], probe: Probe, settings: Strain
-) -> Estimate:
+    earlier: NDArray[np.uint8], later: NDArray[np.uint8], probe: Probe, settings: StrainSettings
+) -> StrainEstimate:
     """Track the earlier image's windows along the beams, and fit lines to their displacement.
 
     Args:
@@ -261,18 +261,18 @@ def estimate_strain(
     search = max(1, round(settings.search / step))
     pixels = probe.beam_pixels
     first, second = (_remapped(each.astype(np.float32), *pixels) for each in (earlier, later))
-    moved, correlation = track(first, second, window=window, search=search)
+    moved, correlation = track_displacement(first, second, window=window, search=search)
     weight = correlation >= max(settings.correlation, 1e-3)
-    steep = slope(moved, weight, _odd(settings.fit / step))
+    steep = fit_slopes(moved, weight, _odd(settings.fit / step))
     steep[np.abs(steep) > _STEEPEST] = np.nan
     # The place in the earlier image changes by 1 - steep along the beam of the later one.
     strain = steep / (np.float32(1.0) - steep)
     seen = correlation != 0.0
     mean = float(np.maximum(correlation[seen], 0.0).mean()) if seen.any() else 0.0
-    return Estimate(_to_pixels(strain, probe), mean)
+    return StrainEstimate(_to_pixels(strain, probe), mean)
 
 
-def require_short_windows(probe: Probe, settings: Strain) -> None:
+def require_short_windows(probe: Probe, settings: StrainSettings) -> None:
     """Refuse windows that no beam has room for.
 
     Raises:
@@ -304,7 +304,7 @@ def _remapped(image: Field, columns: Field, rows: Field) -> Field:
     return np.asarray(cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=edge))
 
 
-class Earlier:
+class FrameHistory:
     """The last frames of one probe and one mesh, as far as they follow one another."""
 
     def __init__(self, kept: Callable[[Frame], Any]) -> None:
@@ -312,7 +312,7 @@ class Earlier:
         self._of: tuple[Any, Any] = (None, None)
         self._frames: deque[tuple[int, Any]] = deque()
 
-    def before(self, frame: Frame, interval: int) -> Any:
+    def get_before(self, frame: Frame, interval: int) -> Any:
         """The value kept of the frame ``interval`` before, or None; this frame's is kept, too.
 
         A frame may be asked about again.
@@ -337,8 +337,8 @@ def warm_up() -> None:
     scanner = BMode(
         Volume(voxels, np.eye(4)), LinearProbe(aperture=0.01, depth=0.01, columns=4, rows=4)
     )
-    scanner.carry(nodes, np.array([[0, 1, 2, 3]]))
-    frame = scanner.frame(Pose(), 1.1 * nodes)
-    displacement(frame)
-    track(np.zeros((40, 4)), np.zeros((40, 4)), window=(3, 3), search=1)
-    AxialStrain.of(frame).image(frame)
+    scanner.attach_mesh(nodes, np.array([[0, 1, 2, 3]]))
+    frame = scanner.make_frame(Pose(), 1.1 * nodes)
+    compute_displacement(frame)
+    track_displacement(np.zeros((40, 4)), np.zeros((40, 4)), window=(3, 3), search=1)
+    AxialStrain.from_frame(frame).compute_strain(frame)

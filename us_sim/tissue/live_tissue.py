@@ -38,7 +38,7 @@ from us_sim.tissue.solvers.solver import (
     Progress,
     SolverSettings,
     TissueSolver,
-    rehearsal_model,
+    make_small_model,
 )
 
 COMPILING_SWITCH_INTERVAL = 1e-4  # s, see above
@@ -47,17 +47,17 @@ _logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Difference:
+class ShapeDifference:
     """How far the nodes of two deformations are apart."""
 
     maximum: float  # m
     rms: float  # m
 
 
-def difference(first: NDArray[np.float64], second: NDArray[np.float64]) -> Difference:
+def measure_difference(first: NDArray[np.float64], second: NDArray[np.float64]) -> ShapeDifference:
     """Largest and root-mean-square distance between two sets of node positions (N, 3) m."""
     square = ((first - second) ** 2).sum(axis=1)
-    return Difference(float(np.sqrt(square.max())), float(np.sqrt(square.mean())))
+    return ShapeDifference(float(np.sqrt(square.max())), float(np.sqrt(square.mean())))
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class _Prepared:
 class LiveTissue:
     """Deforms a tissue by one solver, and by another on the same poses if asked.
 
-    Each solver is made once for a model and its settings, when it is first named. `prepare` makes
+    Each solver is made once for a model and its settings, when it is first named. `prepare_method` makes
     what another method needs in a thread while frames go on; `adopt_prepared` takes it over.
 
     Args:
@@ -105,7 +105,7 @@ class LiveTissue:
     ) -> None:
         self.model = model
         self.method = method
-        self.difference: Difference | None = None  # of the last frame, to the solver beside
+        self.difference: ShapeDifference | None = None  # of the last frame, to the solver beside
         self._constants = constants
         self._solvers: dict[str, TissueSolver] = {}
         self._solvers |= self._make(method, progress).solvers
@@ -120,7 +120,7 @@ class LiveTissue:
         self._progress = ""
 
     @property
-    def preparing(self) -> str:
+    def preparation_status(self) -> str:
         """What is being prepared, for how long already, and how far it is; '' without any."""
         if self._wanted is self.method:
             return ""
@@ -138,7 +138,7 @@ class LiveTissue:
         deformation = self.solver.deform(pose)
         if self._beside is not None:
             self._beside.frame_limit = frame_limit
-            self.difference = difference(deformation.nodes, self._beside.deform(pose).nodes)
+            self.difference = measure_difference(deformation.nodes, self._beside.deform(pose).nodes)
         return deformation
 
     def reset(self) -> None:
@@ -147,7 +147,7 @@ class LiveTissue:
             solver.reset()
         self.difference = None
 
-    def prepare(self, method: TissueMethod, reason: str, *, wait: bool = False) -> None:
+    def prepare_method(self, method: TissueMethod, reason: str, *, wait: bool = False) -> None:
         """Prepare another method; the newest wins, and the present one drops what is prepared.
 
         Args:
@@ -224,7 +224,7 @@ class LiveTissue:
         for name in filter(None, (method.solver, method.compared)):
             made, settings = self._solvers.get(name), method.settings.get(name)
             if made is None or made.model is not model or settings not in (None, made.settings):
-                made = compiled_solver(SOLVERS.load(name), model, settings, progress)
+                made = compile_solver(SOLVERS.load(name), model, settings, progress)
             solvers[name] = made
         return _Prepared(method, model, solvers)
 
@@ -233,7 +233,7 @@ class LiveTissue:
         self._progress = f", {share}{text}"
 
 
-def compiled_solver(
+def compile_solver(
     solver: type[TissueSolver],
     model: TissueModel,
     settings: SolverSettings | None = None,
@@ -253,13 +253,13 @@ def compiled_solver(
     if solver.must_be_held:  # before a minute of compiling
         require_held(model.mesh, model.fixed)
     settings = settings or solver.Settings()
-    with _compiling_said(solver.name, progress):
-        solver.rehearse(rehearsal_model(model), settings)
+    with _report_compiling(solver.name, progress):
+        solver.compile_kernels(make_small_model(model), settings)
         return solver(model, settings, progress)
 
 
 @contextlib.contextmanager
-def _compiling_said(method: str, progress: Progress | None) -> Iterator[None]:
+def _report_compiling(method: str, progress: Progress | None) -> Iterator[None]:
     """Tell ``progress`` of each kernel that this thread compiles within the context."""
 
     def say(number: int) -> None:

@@ -1,13 +1,13 @@
 """The tissue that solvers deform, and the deformation that they find.
 
 >>> from us_sim.tissue.model import TissueModel
->>> model = TissueModel.block()
+>>> model = TissueModel.make_block()
 >>> len(model.mesh.nodes), len(model.contact_nodes)
 (216, 36)
 >>> f"{model.lumped_mass.sum():.3f} kg"
 '1.000 kg'
 >>> fat, muscle = Material(10e3), Material(15e3)
->>> layered = TissueModel.block(layers=[(0.02, fat), (0.03, muscle)], gravity=[0.0, 0.0, 9.81])
+>>> layered = TissueModel.make_block(layers=[(0.02, fat), (0.03, muscle)], gravity=[0.0, 0.0, 9.81])
 >>> f"{np.ptp(layered.mesh.nodes[:, 2]):.2f} m, {layered.load.sum(axis=0)[2]:.3g} N"
 '0.05 m, 4.41 N'
 """
@@ -54,7 +54,7 @@ _FEW, _FEW_PART = 10, 0.01
 _GRAZING = 0.1
 
 
-def held_remark(name: str, nodes: NDArray[np.integer], mesh: TetrahedralMesh) -> str | None:
+def describe_held_nodes(name: str, nodes: NDArray[np.integer], mesh: TetrahedralMesh) -> str | None:
     """How many nodes a name in a scene's ``fixed`` holds, for a person.
 
     Of a mesh from a file, which may touch its bounding box at single nodes, and where they are few.
@@ -115,7 +115,7 @@ def nodes_in_label(
     mesh: TetrahedralMesh, fractions: LabelFractions, label: int
 ) -> NDArray[np.int32]:
     """(K,) nodes whose tetrahedra are mostly filled by a label, such as bone, ascending."""
-    filled = fractions.of(label)
+    filled = fractions.for_label(label)
     around = mesh.tetrahedra.ravel()
     volume = np.bincount(around, np.repeat(mesh.volumes, 4), len(mesh.nodes))
     inside = np.bincount(around, np.repeat(mesh.volumes * filled, 4), len(mesh.nodes))
@@ -192,7 +192,7 @@ class TissueModel:
     forces: NDArray[np.float64] = field(default_factory=_no_load)  # (N, 3), or the same on all, N
 
     @classmethod
-    def block(
+    def make_block(
         cls,
         size: tuple[float, float, float] = (0.1, 0.1, 0.1),
         nodes: tuple[int, int, int] = (6, 6, 6),

@@ -22,7 +22,7 @@ from us_sim.errors import StiffnessError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-from us_sim.tissue.contact.probe_gap import push_out
+from us_sim.tissue.contact.probe_gap import measure_gaps
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
@@ -76,16 +76,16 @@ class StiffnessSettings(Settings):
     def check(self) -> None:
         """Refuse files that exist, before the work."""
         if self.out.suffix.lower() not in (".yaml", ".yml"):
-            raise self.refused("out", f"{self.out}: must be a file that ends in .yaml")
+            raise self.make_error("out", f"{self.out}: must be a file that ends in .yaml")
         for file in (self.out, self.out.with_suffix(".png")):
             if file.exists():
-                raise self.refused("out", f"{file}: exists already; choose another name")
+                raise self.make_error("out", f"{file}: exists already; choose another name")
         if not self.out.absolute().parent.is_dir():
-            raise self.refused("out", f"{self.out}: there is no {self.out.absolute().parent}")
+            raise self.make_error("out", f"{self.out}: there is no {self.out.absolute().parent}")
 
 
 @dataclass(frozen=True, eq=False)
-class Press:
+class RecordedPress:
     """Poses of the probe, and what it felt."""
 
     times: NDArray[np.float64]  # (K,) s
@@ -99,7 +99,7 @@ class StiffnessFit:
 
     moduli: Mapping[str, float]  # Pa, of all structures
     factors: Mapping[str, float]  # of the fitted: their 95 % interval either way
-    press: Press  # the poses that were looked at
+    press: RecordedPress  # the poses that were looked at
     depths: NDArray[np.float64]  # (K,) m
     left: NDArray[np.float64]  # (K, 6) N and N m, measured less modelled and the offset
     offset: NDArray[np.float64]  # (6,) N and N m
@@ -111,7 +111,7 @@ def pair_press(
     felt_at: NDArray[np.int64],
     wrenches: NDArray[np.float64],
     settings: StiffnessSettings,
-) -> Press:
+) -> RecordedPress:
     """Pair poses with the wrench that is nearest in time.
 
     Args:
@@ -140,14 +140,14 @@ def pair_press(
             f"{1e3 * settings.tolerance:g} ms, and {FEWEST} are needed: record both with one clock"
         )
     times = (stamps[near] - stamps[0]) / 1e9
-    return Press(times, [poses[k] for k in near.tolist()], wrenches[nearest[near]])
+    return RecordedPress(times, [poses[k] for k in near.tolist()], wrenches[nearest[near]])
 
 
 def fit_stiffness(
     model: TissueModel,
     constants: Callable[[Mapping[str, float]], TissueMaterials],
     moduli: Mapping[str, float],
-    press: Press,
+    press: RecordedPress,
     settings: StiffnessSettings,
     progress: Progress | None = None,
 ) -> StiffnessFit:
@@ -171,7 +171,7 @@ def fit_stiffness(
     depths = np.array([_depth(model, pose) for pose in press.poses])
     chosen = _choose_poses(depths, settings.poses)
     poses = [press.poses[k] for k in chosen.tolist()]
-    press = Press(press.times[chosen], poses, press.wrenches[chosen])
+    press = RecordedPress(press.times[chosen], poses, press.wrenches[chosen])
     depths = np.maximum(depths[chosen], 0.0)
     lever = np.repeat([1.0, _LEVER], 3)
     state = {"misfit": ""}
@@ -179,7 +179,7 @@ def fit_stiffness(
     def left_over(logarithms: NDArray[np.float64]) -> NDArray[np.float64]:
         tried = {**moduli, **dict(zip(names, np.exp(logarithms).tolist(), strict=True))}
         pressed = replace(model, materials=constants(tried))
-        modelled = press_wrenches(pressed, press.poses, depths, _titled(progress, state))
+        modelled = simulate_wrenches(pressed, press.poses, depths, _titled(progress, state))
         if modelled[:, 2] @ (press.wrenches[:, 2] - press.wrenches[:, 2].mean()) < 0.0:
             raise StiffnessError(
                 "the wrench points the other way: along z the force on the probe falls below zero "
@@ -195,7 +195,7 @@ def fit_stiffness(
     found = least_squares(
         left_over, start, bounds=(start - reach, start + reach), diff_step=_STEP, xtol=1e-4
     )
-    widths = interval_half_widths(found.jac, found.fun)
+    widths = compute_half_widths(found.jac, found.fun)
     wide = [
         name for name, width in zip(names, widths, strict=True) if width > np.log(settings.widest)
     ]
@@ -212,7 +212,7 @@ def fit_stiffness(
         )
     fitted = dict(zip(names, np.exp(found.x).tolist(), strict=True))
     left = found.fun.reshape(-1, 6) * lever
-    modelled = press_wrenches(
+    modelled = simulate_wrenches(
         replace(model, materials=constants({**moduli, **fitted})), press.poses, depths
     )
     return StiffnessFit(
@@ -225,7 +225,7 @@ def fit_stiffness(
     )
 
 
-def press_wrenches(
+def simulate_wrenches(
     model: TissueModel,
     poses: Sequence[Pose],
     depths: NDArray[np.float64],
@@ -253,7 +253,7 @@ def press_wrenches(
     return wrenches
 
 
-def interval_half_widths(
+def compute_half_widths(
     slopes: NDArray[np.float64], left: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """(P,) half of the 95 % intervals of unknowns with slopes (n, P) and residuals (n,)."""
@@ -271,7 +271,7 @@ def interval_half_widths(
 def _depth(model: TissueModel, pose: Pose) -> float:
     """m, of the probe in the tissue at rest; below zero outside."""
     touched = model.mesh.nodes[model.contact_nodes]
-    return -float(push_out(model.collider, pose, touched, model.contact_spacing)[0].min())
+    return -float(measure_gaps(model.collider, pose, touched, model.contact_spacing)[0].min())
 
 
 def _choose_poses(depths: NDArray[np.float64], count: int) -> NDArray[np.intp]:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
-from us_sim.geometry.pose import Pose, product
+from us_sim.geometry.pose import Pose, multiply_quaternions
 from us_sim.geometry.se3 import cross_matrix, left_jacobian, rotation_between, rotation_exp
 from us_sim.settings.registry import FILTERS
 from us_sim.settings.setting import Settings
@@ -69,7 +69,7 @@ def create_filter(name: str, settings: Settings | None = None) -> PoseFilter:
     Raises:
         TrackingError: there is no filter of that name.
     """
-    made: PoseFilter = FILTERS.load(name)(settings or FILTERS.settings(name)())
+    made: PoseFilter = FILTERS.load(name)(settings or FILTERS.load_settings(name)())
     return made
 
 
@@ -121,7 +121,7 @@ class OneEuro(PoseFilter):
             cutoff = self._settings.rotation_minimum_cutoff
             cutoff += self._settings.rotation_speed_coefficient * speed
             turn = _alpha(cutoff, step) * turn
-            self._pose = Pose(position, product(rotation_exp(turn), orientation))
+            self._pose = Pose(position, multiply_quaternions(rotation_exp(turn), orientation))
         self._measured = measurement
         return dataclasses.replace(measurement, pose=self._pose)
 
@@ -204,7 +204,7 @@ class ConstantVelocityKalman(PoseFilter):
             measurement.stamp, pose, self._covariance[_POSE, _POSE], measurement.error
         )
 
-    def predicted(self, stamp: int) -> tuple[_Place, NDArray[np.float64]]:
+    def predict_pose(self, stamp: int) -> tuple[_Place, NDArray[np.float64]]:
         """Predict the pose at a later stamp if its velocity stays, and the error's covariance.
 
         Returns:
@@ -218,7 +218,7 @@ class ConstantVelocityKalman(PoseFilter):
         step = 1e-9 * (stamp - self._stamp)
         turn = step * self._velocity[3:]
         position = self._place[0] + step * self._velocity[:3]
-        place = position, product(rotation_exp(turn), self._place[1])
+        place = position, multiply_quaternions(rotation_exp(turn), self._place[1])
         jacobian = left_jacobian(turn)
         transition = _IDENTITY.copy()
         transition[0:3, 6:9] = step * _IDENTITY[:3, :3]
@@ -233,13 +233,13 @@ class ConstantVelocityKalman(PoseFilter):
         return place, covariance
 
     def _correct(self, measurement: Measurement, noise: NDArray[np.float64]) -> None:
-        place, covariance = self.predicted(measurement.stamp)
+        place, covariance = self.predict_pose(measurement.stamp)
         gain: NDArray[np.float64] = np.linalg.solve(
             covariance[_POSE, _POSE] + noise, covariance[_POSE]
         ).T.astype(np.float64, copy=False)
         turn = rotation_between(place[1], measurement.pose.orientation)
         correction = gain @ np.concatenate([measurement.pose.position - place[0], turn])
-        turned = product(rotation_exp(correction[3:6]), place[1])
+        turned = multiply_quaternions(rotation_exp(correction[3:6]), place[1])
         self._place = place[0] + correction[:3], turned
         self._velocity = self._velocity + correction[_VELOCITY]
         # Joseph's form stays positive however sure a measurement is of itself.

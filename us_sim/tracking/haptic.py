@@ -7,7 +7,7 @@ the wrench:
 >>> wrench = np.array([0.0, 0.0, -2.0, 0.0, 0.0, 0.0])  # N: pressed 10 mm into 200 N/m
 >>> stiffness = np.diag([0.0, 0.0, 200.0, 0.0, 0.0, 0.0])
 >>> wall = ContactModel(0, Pose(position=[0.0, 0.0, 0.01]), wrench, stiffness)
->>> deeper = [wall.answer(np.array([0.0, 0.0, z, 0.0, 0.0, 0.0])) for z in (0.005, -0.005, -0.015)]
+>>> deeper = [wall.compute_wrench(np.array([0.0, 0.0, z, 0.0, 0.0, 0.0])) for z in (0.005, -0.005, -0.015)]
 >>> [round(float(wrench[2]), 6) + 0.0 for _, wrench in deeper]
 [-3.0, -1.0, 0.0]
 """
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from us_sim.geometry import se3
 from us_sim.geometry.frame_chain import PoseHistory
-from us_sim.geometry.pose import Pose, product
+from us_sim.geometry.pose import Pose, multiply_quaternions
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.settings import HapticSettings
 
@@ -34,7 +34,7 @@ _FADING = 0.5  # fraction of the push at the model's pose below which the rest o
 _FARTHEST = 0.03  # m: distance after which the push ends at the latest, however soft the tissue is
 
 
-def wrench_in_patient(pose: Pose, force: Array, torque: Array) -> Array:
+def rotate_to_patient(pose: Pose, force: Array, torque: Array) -> Array:
     """(6,) N, N m: force and torque (3,) along the probe's axes, along those of ``patient``."""
     return np.concatenate([pose.rotation @ force, pose.rotation @ torque])
 
@@ -76,7 +76,7 @@ class ContactModel:
         rest = self.stiffness + lacking * np.outer(along, along) - np.outer(slope, shape)
         return direction, force, slope, self.wrench - force * shape, rest
 
-    def answer(self, displacement: Array) -> tuple[float, Array]:
+    def compute_wrench(self, displacement: Array) -> tuple[float, Array]:
         """The energy (J) and the wrench (6,) N, N m at a displacement (6,) m, rad."""
         energy, wrench = self._slope(displacement)
         turn = displacement[3:]
@@ -137,7 +137,7 @@ class HapticRendering:
 
     After any doubt the wrench is zero, until a model comes that is newer, and then grows slowly.
 
-    `pose`, `model`, `clutch` and `distrust` may be called while another thread renders.
+    `update_pose`, `update_model`, `set_clutch` and `stop_rendering` may be called while another thread renders.
 
     Args:
         settings: limits and times.
@@ -179,26 +179,26 @@ class HapticRendering:
         """ns, of the newest pose of the handle."""
         return self._handle.stamps[-1] if self._handle.stamps else None
 
-    def pose(self, stamp: int, pose: Pose, now: int) -> None:
+    def update_pose(self, stamp: int, pose: Pose, now: int) -> None:
         """Take a pose of the handle in the arm's frame; stamp and time of arrival in ns."""
         self._arrived.append((stamp, pose, now))
 
-    def model(self, model: ContactModel, now: int) -> None:
+    def update_model(self, model: ContactModel, now: int) -> None:
         """Take a model of the contact; time of arrival in ns."""
         self._arrived_model.append((model, now))
 
-    def clutch(self, held: bool) -> None:
+    def set_clutch(self, held: bool) -> None:
         """Take the state of the clutch: while it is held nothing is felt."""
         self._is_clutched = held
 
-    def distrust(self, why: str) -> None:
+    def stop_rendering(self, why: str) -> None:
         """Stop, for a reason, because input cannot be used."""
         self._distrusted.append(why)
 
     def render(self, now: int) -> Array:
         """(6,) N, N m on the handle until the next tick, about its origin, axes of the arm.
 
-        ``now`` is in ns of the clock of `pose` and `model`.
+        ``now`` is in ns of the clock of `update_pose` and `update_model`.
         """
         doubt = self._take_poses(now)
         self.energy -= float(self._felt @ self._motion)
@@ -214,7 +214,9 @@ class HapticRendering:
         age = now - self._model_time
         if age > 1e9 * self._settings.model_timeout:
             return self._doubted(f"no model of the contact for {1e-6 * age:.0f} ms")
-        moved = self._device.probe_moved(self._model.pose, self._anchor, self._handle.poses[-1])
+        moved = self._device.compute_probe_motion(
+            self._model.pose, self._anchor, self._handle.poses[-1]
+        )
         distance, turn = _lengths(moved)
         if distance > _REACH:
             return self._doubted(
@@ -227,9 +229,9 @@ class HapticRendering:
         self.doubt = ""
         if self._begun is None:
             self._begun = now
-        stored, wrench = self._model.answer(moved)
+        stored, wrench = self._model.compute_wrench(moved)
         wrench += self._left(now)
-        felt = self._device.on_handle(self._model.pose, moved[3:], wrench)
+        felt = self._device.compute_handle_wrench(self._model.pose, moved[3:], wrench)
         felt = self._limited(self._unilateral(felt))
         felt *= min(1e-9 * (now - self._begun) / self._settings.ramp, 1.0)
         if self.energy > 0.0:
@@ -259,7 +261,7 @@ class HapticRendering:
                     doubt = f"the handle has jumped by {math.degrees(turn):.0f}°"
                 else:
                     self._motion = self._motion + motion
-            self._handle.add(stamp, pose)
+            self._handle.append_pose(stamp, pose)
             self._pose_time = time
         if doubt:
             return doubt
@@ -274,15 +276,19 @@ class HapticRendering:
         stamp = model.stamp - self._time_offset
         if self._not_before is not None and stamp <= self._not_before:
             return
-        anchor = self._handle.at(stamp)
+        anchor = self._handle.interpolate_at(stamp)
         if anchor is None:
             return
         before = self._model
         if before is not None and not self.doubt:
             # The wrench felt now fades into the new model's.
             handle = self._handle.poses[-1]
-            _, old = before.answer(self._device.probe_moved(before.pose, self._anchor, handle))
-            _, new = model.answer(self._device.probe_moved(model.pose, anchor, handle))
+            _, old = before.compute_wrench(
+                self._device.compute_probe_motion(before.pose, self._anchor, handle)
+            )
+            _, new = model.compute_wrench(
+                self._device.compute_probe_motion(model.pose, anchor, handle)
+            )
             self._left_over = old + self._left(time) - new
             self._since = time
         self._model, self._anchor, self._model_time = model, anchor, time
@@ -310,7 +316,7 @@ class HapticRendering:
     def _unilateral(self, felt: Array) -> Array:
         """The wrench, less a force that would pull the handle against the tissue's push."""
         assert self._model is not None
-        push = self._device.direction_on_handle(self._model.push)
+        push = self._device.rotate_to_handle(self._model.push)
         pulled = float(felt[:3] @ push)
         if pulled < 0.0:
             felt[:3] -= pulled * push
@@ -386,7 +392,7 @@ class HapticDevice:
         self._last: Pose | None = None  # of the handle
         self.is_held = False
 
-    def take(self, pose: Pose, stamp: int) -> Measurement:
+    def measure_body(self, pose: Pose, stamp: int) -> Measurement:
         """The body that carries the probe, from the handle's pose at a stamp, in the arm's frame.
 
         Args:
@@ -398,22 +404,22 @@ class HapticDevice:
             self._held = body
         return Measurement(stamp, body)
 
-    def clutch(self, held: bool) -> None:
+    def set_clutch(self, held: bool) -> None:
         """Hold the probe where it is, or let it go on from there."""
         if held and not self.is_held and self._last is not None:
             self._held = self._body(self._last)
         if not held and self._held is not None and self._last is not None:
             x, y, z, w = self._last.orientation
             self._offset = self._held.position - self._scale * self._last.position
-            self._regrip = product(np.array([-x, -y, -z, w]), self._held.orientation)
+            self._regrip = multiply_quaternions(np.array([-x, -y, -z, w]), self._held.orientation)
             self._held = None
         self.is_held = held
 
     def _body(self, pose: Pose) -> Pose:
-        turned = product(pose.orientation, self._regrip)
+        turned = multiply_quaternions(pose.orientation, self._regrip)
         return Pose(self._scale * pose.position + self._offset, turned)
 
-    def probe_moved(self, probe: Pose, before: Pose, now: Pose) -> Array:
+    def compute_probe_motion(self, probe: Pose, before: Pose, now: Pose) -> Array:
         """How the probe moves with the handle, whatever the clutch did earlier.
 
         Args:
@@ -431,7 +437,7 @@ class HapticDevice:
             moved[:3] += _turned(arm, moved[3:]) - arm
         return moved
 
-    def on_handle(self, probe: Pose, turn: Array, wrench: Array) -> Array:
+    def compute_handle_wrench(self, probe: Pose, turn: Array, wrench: Array) -> Array:
         """(6,) N, N m on the handle, about its origin along the axes of the arm.
 
         Its work is that of the wrench on the probe times `work_ratio`: what takes no energy there
@@ -451,7 +457,7 @@ class HapticDevice:
         felt[3:] = self.work_ratio * (torque @ self._turn)
         return felt
 
-    def direction_on_handle(self, direction: Array) -> Array:
+    def rotate_to_handle(self, direction: Array) -> Array:
         """(3,) along the axes of the arm, of (3,) along those of ``patient``."""
         return direction @ self._turn
 

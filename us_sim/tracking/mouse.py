@@ -6,7 +6,7 @@ each ±1 at full deflection.
 >>> from us_sim.tracking.mouse import SixDofMouse
 >>> mouse = SixDofMouse(SixDofMouseSettings(speed=["50 mm/s", "-50 mm/s", "-50 mm/s"]))
 >>> for tick in range(101):  # a second at 100 Hz, pushed down
-...     probe = mouse.axes([0.0, 0.0, -1.0, 0.0, 0.0, 0.0], [], tick * 10_000_000)
+...     probe = mouse.move_probe([0.0, 0.0, -1.0, 0.0, 0.0, 0.0], [], tick * 10_000_000)
 >>> probe.pose.position.round(6).tolist()  # from 10 mm above
 [0.0, 0.0, 0.04]
 """
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
 from us_sim.geometry import se3
-from us_sim.geometry.pose import Pose, product
+from us_sim.geometry.pose import Pose, multiply_quaternions
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.settings import SixDofMouseSettings
 
@@ -52,7 +52,9 @@ class SixDofMouse:
         self._twist = np.zeros(6)  # of the last message, m/s and rad/s
         self._held: dict[int, bool] = {}
 
-    def axes(self, axes: Sequence[float], buttons: Sequence[int], stamp: int) -> Measurement | None:
+    def move_probe(
+        self, axes: Sequence[float], buttons: Sequence[int], stamp: int
+    ) -> Measurement | None:
         """Move the probe by a message; None where that cannot be used: `last_problem` says why.
 
         Args:
@@ -116,7 +118,7 @@ class SixDofMouse:
         if self._settings.frame == "probe":
             return pose @ se3.exp(twist)
         # Along the patient's axes, and turned about the probe's face.
-        turn = product(se3.rotation_exp(twist[3:]), pose.orientation)
+        turn = multiply_quaternions(se3.rotation_exp(twist[3:]), pose.orientation)
         return Pose(pose.position + twist[:3], turn)
 
 
@@ -141,7 +143,7 @@ class SpaceMouseReports:
         #: 1 for each that is pressed.
         self.buttons = [0, 0]
 
-    def take(self, report: bytes) -> bool:
+    def parse_report(self, report: bytes) -> bool:
         """Take a report; returns whether it is about axes or buttons.
 
         Older devices send translation and rotation one after the other, newer ones together.
@@ -200,7 +202,7 @@ class SpaceMouse(SpaceMouseReports):
                 f"program that uses it"
             ) from error
 
-    def wait(self, seconds: float) -> bool:
+    def wait_for_report(self, seconds: float) -> bool:
         """Take the next report, if one comes in time; whether something has changed.
 
         Raises:
@@ -210,7 +212,7 @@ class SpaceMouse(SpaceMouseReports):
             report = self._device.read(_REPORT_BYTES, max(round(seconds * 1e3), 1))
         except (OSError, ValueError) as error:
             raise TrackingError(f"{self.name} is gone ({error}): plug it in again") from error
-        return self.take(bytes(report))
+        return self.parse_report(bytes(report))
 
     def close(self) -> None:
         """Let go of the device."""

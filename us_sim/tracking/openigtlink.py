@@ -4,12 +4,12 @@ Messages are those of openigtlink.org, versions 1 to 3: big-endian and in millim
 whose checksum is wrong is refused; senders that make none write 0. The package pyigtl knows neither
 TDATA, POSITION nor metadata, checks no checksum of what it receives, and takes a process' signals.
 
->>> from us_sim.tracking.openigtlink import HEADER, header_of, poses_in, transform_message
+>>> from us_sim.tracking.openigtlink import HEADER, parse_header, parse_poses, pack_transform
 >>> matrix = np.eye(4)
 >>> matrix[:3, 3] = [0.01, 0.02, 0.03]
->>> message = transform_message("ProbeToTracker", 1_500_000_000, matrix)
->>> header = header_of(message[: HEADER.size])
->>> [(name, matrix)] = poses_in(header, message[HEADER.size :])
+>>> message = pack_transform("ProbeToTracker", 1_500_000_000, matrix)
+>>> header = parse_header(message[: HEADER.size])
+>>> [(name, matrix)] = parse_poses(header, message[HEADER.size :])
 >>> name, matrix[:3, 3].round(6)
 ('ProbeToTracker', array([0.01, 0.02, 0.03]))
 """
@@ -67,7 +67,7 @@ class Header:
     checksum: int = 0  # of the body; 0 where the sender makes none
 
 
-def header_of(data: bytes) -> Header:
+def parse_header(data: bytes) -> Header:
     """The header in its 58 bytes.
 
     Raises:
@@ -84,7 +84,7 @@ def header_of(data: bytes) -> Header:
     return Header(version, name, _text(device), stamp, size, checksum)
 
 
-def poses_in(header: Header, body: bytes) -> list[tuple[str, NDArray[np.float64]]]:
+def parse_poses(header: Header, body: bytes) -> list[tuple[str, NDArray[np.float64]]]:
     """Names and matrices (4, 4) m of the bodies in a message of one of `POSE_KINDS`.
 
     The matrices are as they were sent: maybe not rigid, or not finite. A POSITION may be without
@@ -114,7 +114,7 @@ def poses_in(header: Header, body: bytes) -> list[tuple[str, NDArray[np.float64]
     return [(header.device, _of_columns(numbers) if is_matrix else _of_quaternion(numbers))]
 
 
-def transform_message(
+def pack_transform(
     device: str, stamp: int, matrix: NDArray[np.float64], *, per_pixel: bool = False
 ) -> bytes:
     """A TRANSFORM message of version 1, at ``stamp`` ns, of an affine matrix (4, 4).
@@ -126,7 +126,7 @@ def transform_message(
     return _packed("TRANSFORM", device, stamp, numbers.astype(">f4").tobytes())
 
 
-def image_message(
+def pack_image(
     device: str, stamp: int, pixels: NDArray[np.uint8], matrix: NDArray[np.float64], world: str
 ) -> bytes:
     """An IMAGE message of version 1, at ``stamp`` ns, of grey pixels (rows, columns).
@@ -310,7 +310,7 @@ class OpenIGTLinkClient:
             self._heard = time.monotonic()
             stream = connection.makefile("rb")
             while not self._closing.is_set():
-                header = header_of(_read(stream, HEADER.size))
+                header = parse_header(_read(stream, HEADER.size))
                 if header.size > _LONGEST:
                     raise TrackingError(f"a {header.kind} of {header.size} bytes cannot be")
                 body = _read(stream, header.size)
@@ -319,7 +319,7 @@ class OpenIGTLinkClient:
 
     def _handle(self, header: Header, body: bytes) -> None:
         try:
-            poses = poses_in(header, body)
+            poses = parse_poses(header, body)
         except TrackingError as error:
             if self._is_wanted(header.device) or header.kind.endswith("TDATA"):
                 self._problem("message", f"{self.place}: {error}; it is not used")
@@ -420,11 +420,11 @@ class OpenIGTLinkServer:
         threading.Thread(target=self._listener.serve_forever, args=(_LOOK_S,), daemon=True).start()
 
     @property
-    def clients(self) -> int:
+    def client_count(self) -> int:
         """Number of clients connected."""
         return len(self._waiting)
 
-    def send(self, name: str, message: bytes) -> None:
+    def send_message(self, name: str, message: bytes) -> None:
         """Send a message to all clients; one of the same name that has not left yet is dropped."""
         with self._changed:
             for waiting in self._waiting.values():

@@ -5,7 +5,7 @@
 >>> from us_sim.tracking.measurement import Measurement
 >>> from us_sim.tracking.outlier_gate import OutlierGate
 >>> gate = OutlierGate(GateSettings(maximum_speed="1 m/s", jump="5 mm", accept_after=3))
->>> [gate.judge(Measurement(k * 10_000_000, Pose([x, 0, 0]))).value
+>>> [gate.judge_measurement(Measurement(k * 10_000_000, Pose([x, 0, 0]))).value
 ...  for k, x in enumerate([0.0, 0.5, 0.01, 0.2, 0.2, 0.2])]
 ['believed', 'refused', 'believed', 'refused', 'refused', 'new place']
 """
@@ -62,7 +62,7 @@ class OutlierGate:
         self._support = 0  # how many have been believed at this place
         self.reason = ""
 
-    def judge(self, measurement: Measurement) -> Verdict:
+    def judge_measurement(self, measurement: Measurement) -> Verdict:
         """Judge a measurement newer than any before; if it is refused, `reason` says why."""
         self.reason = self._doubt(measurement)
         verdict = Verdict.BELIEVED

@@ -11,10 +11,10 @@
 >>> marker_on_grip = Pose([0.0, 0.0, 0.12])  # the probe's face is 120 mm from it
 >>> filter, gate = create_filter("none"), OutlierGate(GateSettings())
 >>> tracking = ProbeTracking(camera_above, marker_on_grip, filter, gate, time_offset=-0.02)
->>> probe = tracking.take(Measurement(5_000_000_000, Pose([0.0, 0.0, 0.29])), 5_010_000_000)
->>> probe.stamp, probe.pose.position.round(6).tolist(), tracking.state(5_010_000_000).value
+>>> probe = tracking.process_measurement(Measurement(5_000_000_000, Pose([0.0, 0.0, 0.29])), 5_010_000_000)
+>>> probe.stamp, probe.pose.position.round(6).tolist(), tracking.find_state(5_010_000_000).value
 (4980000000, [0.0, 0.0, 0.01], 'tracked')
->>> tracking.take(Measurement(5_010_000_000, Pose([0.0, 0.0, 0.9])), 5_020_000_000)
+>>> tracking.process_measurement(Measurement(5_010_000_000, Pose([0.0, 0.0, 0.9])), 5_020_000_000)
 >>> tracking.last_problem
 'the pose is 610.0 mm from the one 10.0 ms before, where 25.0 mm are believed'
 """
@@ -24,7 +24,7 @@ from __future__ import annotations
 import dataclasses
 from collections import Counter
 
-from us_sim.geometry.pose import Pose, product
+from us_sim.geometry.pose import Pose, multiply_quaternions
 from us_sim.geometry.se3 import adjoint
 from us_sim.tracking.filters import PoseFilter
 from us_sim.tracking.measurement import Measurement, TrackingState
@@ -76,8 +76,8 @@ class ProbeTracking:
         self._newest = self._believed = self._seen = None
         self._start_anew()
 
-    def state(self, now_ns: int) -> TrackingState:
-        """Whether the probe is tracked at a time of the clock that `take` is told.
+    def find_state(self, now_ns: int) -> TrackingState:
+        """Whether the probe is tracked at a time of the clock that `process_measurement` is told.
 
         Where the clock was set back, the last pose's age counts anew.
         """
@@ -89,12 +89,12 @@ class ProbeTracking:
             return TrackingState.TRACKED
         return TrackingState.COASTING if age < self._longest_gap else TrackingState.LOST
 
-    def refuse(self, kind: str, sentence: str) -> None:
+    def count_refusal(self, kind: str, sentence: str) -> None:
         """Count a measurement that cannot be used, be it one that never became a pose."""
         self.refused[kind] += 1
         self.last_refused, self.last_problem = kind, sentence
 
-    def take(self, measurement: Measurement, now_ns: int) -> Measurement | None:
+    def process_measurement(self, measurement: Measurement, now_ns: int) -> Measurement | None:
         """The probe in ``patient``, or None where the measurement is refused.
 
         Why is then in `last_problem`, and `last_refused` is what it is counted as in `refused`:
@@ -105,16 +105,16 @@ class ProbeTracking:
             now_ns: when it arrived.
         """
         if not self._in_order(measurement.stamp):
-            self.refuse("order", "the pose is not newer than the one before it")
+            self.count_refusal("order", "the pose is not newer than the one before it")
             return None
         probe = self._of_probe(measurement)
         found = self._believed is not None and probe.stamp - self._believed > self._longest_gap
         if found:
             self.filter.reset()
         if self._gate is not None:
-            verdict = self._gate.judge(probe)
+            verdict = self._gate.judge_measurement(probe)
             if verdict is Verdict.REFUSED:
-                self.refuse("gate", self._gate.reason)
+                self.count_refusal("gate", self._gate.reason)
                 return None
             if verdict is Verdict.NEW_PLACE:
                 self.restarts["place"] += 1
@@ -151,10 +151,10 @@ class ProbeTracking:
             return measurement
         body = measurement.pose
         lever = body.rotation @ self._calibration.position
-        turned = product(self._registration.orientation, body.orientation)
+        turned = multiply_quaternions(self._registration.orientation, body.orientation)
         pose = Pose(
             self._registration.position + self._to_patient @ (body.position + lever),
-            product(turned, self._calibration.orientation),
+            multiply_quaternions(turned, self._calibration.orientation),
         )
         covariance = measurement.covariance
         if covariance is not None and not covariance.any():

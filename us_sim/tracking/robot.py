@@ -5,9 +5,9 @@ to the tissue by an admittance without mass, a damper: it moves at (wanted - fel
 
 >>> from us_sim.tracking.robot import Robot, RobotSettings
 >>> robot = Robot(RobotSettings(damping=400.0, lift="10 mm"))
->>> robot.ask_force(0.0, 4.0)
->>> robot.feel(0.0, 3.0)
->>> [round(1e3 * float(robot.move(time).position[2]), 3) for time in (0.0, 0.1)]  # mm
+>>> robot.request_force(0.0, 4.0)
+>>> robot.update_force(0.0, 3.0)
+>>> [round(1e3 * float(robot.move_until(time).position[2]), 3) for time in (0.0, 0.1)]  # mm
 [-10.0, -9.75]
 """
 
@@ -43,7 +43,7 @@ class Reach(Protocol):
     def lean(self) -> float: ...
 
 
-def kept_within(pose: Pose, before: Pose, reach: Reach) -> Pose:
+def clip_to_reach(pose: Pose, before: Pose, reach: Reach) -> Pose:
     """The pose, with its place clipped to the reach, and not turned where that leads beyond it."""
     low = [-reach.aside, -reach.aside, -reach.lift]
     position = np.clip(pose.position, low, [reach.aside, reach.aside, reach.press])
@@ -51,7 +51,7 @@ def kept_within(pose: Pose, before: Pose, reach: Reach) -> Pose:
     return Pose(position, before.orientation if leans else pose.orientation)
 
 
-def approach_speed(wanted: float, felt: float, damping: float, most: float) -> float:
+def compute_approach_speed(wanted: float, felt: float, damping: float, most: float) -> float:
     """m/s along the probe's axis, by which an admittance seeks a force.
 
     Against tissue of k N/m, felt T s late, the force obeys f' = (k / damping) (wanted - f(t - T)).
@@ -119,7 +119,7 @@ class Robot:
         self._wanted = self._felt = (-math.inf, 0.0)
         self.action = "at rest"  # for a person
 
-    def ask_velocity(
+    def request_velocity(
         self, time: float, twist: NDArray[np.float64], *, in_patient: bool = False
     ) -> None:
         """Ask for a velocity (6,) m/s, rad/s along the axes of the probe, or of ``patient``."""
@@ -127,15 +127,15 @@ class Robot:
             twist = (twist.reshape(2, 3) @ self.pose.rotation).ravel()
         self._twist = time, twist
 
-    def ask_force(self, time: float, force: float) -> None:
+    def request_force(self, time: float, force: float) -> None:
         """Ask for a force, N by which the probe presses along its axis."""
         self._wanted = time, force
 
-    def feel(self, time: float, force: float) -> None:
+    def update_force(self, time: float, force: float) -> None:
         """Take the force, N by which the probe presses along its axis."""
         self._felt = time, force
 
-    def move(self, time: float) -> Pose:
+    def move_until(self, time: float) -> Pose:
         """Move until a time, and return the probe's pose in ``patient``."""
         given = self._settings
         passed = 0.0 if self._time is None else min(max(time - self._time, 0.0), LONGEST_STEP)
@@ -148,7 +148,7 @@ class Robot:
             change = wanted[part] - self._velocity[part]
             self._velocity[part] += _shortened(change, most * passed)
         moved = self.pose @ exp(self._velocity * passed)
-        self.pose = kept_within(moved, self.pose, given)
+        self.pose = clip_to_reach(moved, self.pose, given)
         return self.pose
 
     def _wanted_velocity(self, time: float) -> NDArray[np.float64]:
@@ -161,7 +161,9 @@ class Robot:
         if time - self._wanted[0] <= given.timeout:
             wanted = min(max(self._wanted[1], 0.0), given.force)
             if time - self._felt[0] <= given.timeout:
-                velocity[2] = approach_speed(wanted, self._felt[1], given.damping, given.speed)
+                velocity[2] = compute_approach_speed(
+                    wanted, self._felt[1], given.damping, given.speed
+                )
                 self.action = f"seeking {wanted:.1f} N"
             else:
                 velocity[2] = 0.0

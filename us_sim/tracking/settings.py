@@ -256,15 +256,17 @@ class SixDofMouseSettings(Settings):
     def check(self) -> None:
         """Six axes, two buttons, and a home in the workspace."""
         if len(set(self.axes)) != len(self.axes):
-            raise self.refused("axes", f"{self.axes} must be six different whole numbers, from 0")
+            raise self.make_error(
+                "axes", f"{self.axes} must be six different whole numbers, from 0"
+            )
         if self.clutch_button == self.reset_button >= 0:
-            raise self.refused(
+            raise self.make_error(
                 "reset_button",
                 f"{self.reset_button} is the clutch already: name another button, or -1 for none",
             )
         bounds = zip(self.workspace_low, self.home, self.workspace_high, strict=True)
         if not all(low <= place <= high for low, place, high in bounds):
-            raise self.refused(
+            raise self.make_error(
                 "home",
                 f"{self.home} is outside the workspace from {self.workspace_low} to "
                 f"{self.workspace_high}: move it, or widen the workspace",
@@ -302,4 +304,4 @@ class OpenIGTLinkSettings(Settings):
     def check(self) -> None:
         """A server has a name."""
         if not self.host.strip():
-            raise self.refused("host", "is empty: name the server, or localhost")
+            raise self.make_error("host", "is empty: name the server, or localhost")

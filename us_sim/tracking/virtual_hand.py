@@ -5,12 +5,12 @@ Manipulation", Journal of Ultrasound in Medicine 18, 1999, 169-175): sliding alo
 compressing along its normal, rotating about it, fanning about the probe's x axis (the array), and
 rocking about its y axis, within the image plane.
 
->>> from us_sim.tracking.virtual_hand import Motion, RestSurface, Stance
->>> skin = RestSurface.plane(0.1)
+>>> from us_sim.tracking.virtual_hand import StanceMotion, StandingSurface, Stance
+>>> skin = RestSurface.create_plane(0.1)
 >>> pressed = Stance([0.02, 0.0, 0.0], press=0.005, fan=math.radians(10))
->>> (1e3 * pressed.pose(skin).position).round(6).tolist()  # mm
+>>> (1e3 * pressed.compute_pose(skin).position).round(6).tolist()  # mm
 [20.0, 0.0, 5.0]
->>> again = Stance.of(pressed.pose(skin), skin)
+>>> again = Stance.from_pose(pressed.compute_pose(skin), skin)
 >>> round(1e3 * again.press, 6), round(math.degrees(again.fan), 6)
 (5.0, 10.0)
 """
@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import MeshError, PoseError
-from us_sim.geometry.pose import Pose, product
+from us_sim.geometry.pose import Pose, multiply_quaternions
 from us_sim.geometry.se3 import rotation_exp
 
 _TURNS, _NEAR = 30, 1e-9
@@ -43,7 +43,7 @@ class Foot:
     normal: NDArray[np.float64]  # (3,) unit length, out of the body, without jumps along the skin
 
 
-class RestSurface:
+class StandingSurface:
     """Triangles whose normals are made smooth, since a probe on facets would jerk at their edges.
 
     The normal at a point is interpolated between those of its triangle's corners (Phong 1975), and
@@ -79,15 +79,15 @@ class RestSurface:
         """(3,) m, the corners of the box around it."""
 
     @classmethod
-    def plane(cls, half: float) -> RestSurface:
+    def create_plane(cls, half: float) -> StandingSurface:
         """The square of z = 0 within ``half`` m around the origin, with the body at z > 0."""
         vertices = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
         return cls(np.insert(vertices, 2, 0.0, axis=1), np.array([[0, 2, 1], [0, 3, 2]]))
 
     @classmethod
-    def upper_side(
+    def create_upper_side(
         cls, vertices: NDArray[np.floating], triangles: NDArray[np.integer]
-    ) -> RestSurface:
+    ) -> StandingSurface:
         """The part of a closed surface that faces -z, on which a probe can stand.
 
         Arguments are as for the class itself.
@@ -100,7 +100,7 @@ class RestSurface:
         faces_up = -across[:, 2] > _FACING_UP * np.linalg.norm(across, axis=1)
         return cls(vertices, triangles[faces_up])
 
-    def closest(self, point: NDArray[np.float64]) -> Foot:
+    def find_closest(self, point: NDArray[np.float64]) -> Foot:
         """Find the surface's closest point to one (3,) m."""
         offsets = self._centres - point
         distances = np.sqrt(np.einsum("tx,tx->t", offsets, offsets))
@@ -112,14 +112,14 @@ class RestSurface:
         best = int(np.einsum("tx,tx->t", off, off).argmin())
         return self._foot(int(near[best]), weights[best])
 
-    def above(self, x: float, y: float) -> Foot:
+    def find_top(self, x: float, y: float) -> Foot:
         """Find the point of the surface's top at x, y (m), or near it where there is none.
 
         It is the closest to a point on the line along z, which then is put on its tangent plane.
         """
         height = float(self.lower[2])
         for _ in range(_TURNS):
-            foot = self.closest(np.array([x, y, height]))
+            foot = self.find_closest(np.array([x, y, height]))
             aside = np.array([x, y]) - foot.point[:2]
             if float(np.abs(aside).max()) < _NEAR:
                 break
@@ -127,21 +127,21 @@ class RestSurface:
             height = float(foot.point[2] + slope)
         return foot
 
-    def under(self, position: NDArray[np.float64]) -> tuple[Foot, float]:
+    def find_foot(self, position: NDArray[np.float64]) -> tuple[Foot, float]:
         """Find the foot on whose normal a position (3,) m lies, and how far inwards (m) that is.
 
         Near the edge of a surface that is not closed there may be none: then it is the closest.
         """
         point = position
         for _ in range(_TURNS):
-            foot = self.closest(point)
+            foot = self.find_closest(point)
             offset = position - foot.point
             inwards = -float(offset @ foot.normal)
             aside = offset + inwards * foot.normal
             if float(np.abs(aside).max()) < _NEAR:
                 return foot, inwards
             point = foot.point + aside
-        foot = self.closest(position)
+        foot = self.find_closest(position)
         return foot, -float((position - foot.point) @ foot.normal)
 
     def _foot(self, triangle: int, weights: NDArray[np.float64]) -> Foot:
@@ -191,7 +191,7 @@ class Approach:
         self._lead = self.place.copy()
         self.goal: NDArray[np.float64] = self.place.copy()
 
-    def distance(self) -> float:
+    def compute_distance(self) -> float:
         """Return how far it, or its lead, still is from the goal."""
         return max(math.dist(self.goal, self._lead), math.dist(self.goal, self.place))
 
@@ -224,7 +224,7 @@ _TURNING = math.pi  # rad/s, of rotation, fan and rock together, against the ski
 _TIME_CONSTANT = 0.02  # s; following a slow mouse, the probe is twice that behind
 
 
-class Motion:
+class StanceMotion:
     """Takes the probe to the stance that was asked for last.
 
     Sliding, pressing and turning each go at their own pace, see `Approach`. The way from one
@@ -252,13 +252,13 @@ class Motion:
     @property
     def is_at_rest(self) -> bool:
         """Whether it is where it goes."""
-        metres = max(self._slide.distance(), self._press.distance())
-        return metres < _AT_REST and self._turn.distance() < _ALIGNED
+        metres = max(self._slide.compute_distance(), self._press.compute_distance())
+        return metres < _AT_REST and self._turn.compute_distance() < _ALIGNED
 
-    def aim(self, stance: Stance) -> None:
+    def aim_at(self, stance: Stance) -> None:
         """Go there from now on, turning the shorter way."""
         self._slide.goal, self._press.goal, turn = _parts(stance)
-        turn[0] = self._turn.place[0] + half_turn(turn[0] - self._turn.place[0])
+        turn[0] = self._turn.place[0] + wrap_angle(turn[0] - self._turn.place[0])
         self._turn.goal = turn
 
     def advance(self, seconds: float) -> Stance:
@@ -278,7 +278,7 @@ def _stance(
     point: NDArray[np.float64], press: NDArray[np.float64], turn: NDArray[np.float64]
 ) -> Stance:
     rotation, fan, rock = turn.tolist()
-    return Stance(point, float(press[0]), half_turn(rotation), fan, rock)
+    return Stance(point, float(press[0]), wrap_angle(rotation), fan, rock)
 
 
 _AXES = np.eye(3)
@@ -314,11 +314,13 @@ class Stance:
         object.__setattr__(self, "point", point)
 
     @classmethod
-    def of(cls, pose: Pose, surface: RestSurface) -> Stance:
-        """Find the stance of a probe that is somewhere already: the way back from `pose`."""
-        foot, press = surface.under(pose.position)
+    def from_pose(cls, pose: Pose, surface: StandingSurface) -> Stance:
+        """Find the stance of a probe that is somewhere already: the way back from `compute_pose`."""
+        foot, press = surface.find_foot(pose.position)
         x, y, z, w = _upright(foot.normal)
-        turned = Pose(np.zeros(3), product(np.array([-x, -y, -z, w]), pose.orientation)).rotation
+        turned = Pose(
+            np.zeros(3), multiply_quaternions(np.array([-x, -y, -z, w]), pose.orientation)
+        ).rotation
         # Rz(rotation) Rx(fan) Ry(rock), taken apart (Diebel 2006, sequence 3-1-2).
         fan = math.asin(float(np.clip(turned[2, 1], -1.0, 1.0)))
         if math.hypot(turned[0, 1], turned[1, 1]) < 1e-9:  # fanned by a quarter turn
@@ -327,42 +329,42 @@ class Stance:
         return cls(foot.point, press, rotation, fan, math.atan2(-turned[2, 0], turned[2, 2]))
 
     @classmethod
-    def home(cls, surface: RestSurface, press: float) -> Stance:
+    def create_home(cls, surface: StandingSurface, press: float) -> Stance:
         """Stand upright above the origin of ``patient``, or on the middle of a surface not there;
         ``press`` in m.
         """
         middle = 0.5 * (surface.lower + surface.upper)
         inside = (surface.lower[:2] <= 0.0).all() and (surface.upper[:2] >= 0.0).all()
         x, y = (0.0, 0.0) if inside else middle[:2].tolist()
-        return cls(surface.above(x, y).point, press)
+        return cls(surface.find_top(x, y).point, press)
 
-    def pose(self, surface: RestSurface) -> Pose:
+    def compute_pose(self, surface: StandingSurface) -> Pose:
         """Return the pose of the probe in ``patient``."""
-        foot = surface.closest(self.point)
+        foot = surface.find_closest(self.point)
         orientation = _upright(foot.normal)
         for axis, angle in ((2, self.rotation), (0, self.fan), (1, self.rock)):
-            orientation = product(orientation, rotation_exp(angle * _AXES[axis]))
+            orientation = multiply_quaternions(orientation, rotation_exp(angle * _AXES[axis]))
         return Pose(foot.point - self.press * foot.normal, orientation)
 
-    def slid(self, surface: RestSurface, along_x: float, along_y: float) -> Stance:
+    def slide_along(self, surface: StandingSurface, along_x: float, along_y: float) -> Stance:
         """Slide along the probe's own x and y, m, as it is rotated, to the closest of the skin."""
-        foot = surface.closest(self.point)
-        turned = product(_upright(foot.normal), rotation_exp(self.rotation * _AXES[2]))
+        foot = surface.find_closest(self.point)
+        turned = multiply_quaternions(_upright(foot.normal), rotation_exp(self.rotation * _AXES[2]))
         way = Pose(np.zeros(3), turned).rotation @ np.array([along_x, along_y, 0.0])
-        return replace(self, point=surface.closest(foot.point + way).point)
+        return replace(self, point=surface.find_closest(foot.point + way).point)
 
-    def within_reach(self) -> Stance:
+    def clip_to_reach(self) -> Stance:
         """Press and turn no further than a hand may."""
         return replace(
             self,
             press=min(max(self.press, -HIGHEST), DEEPEST),
-            rotation=half_turn(self.rotation),
+            rotation=wrap_angle(self.rotation),
             fan=min(max(self.fan, -STEEPEST), STEEPEST),
             rock=min(max(self.rock, -STEEPEST), STEEPEST),
         )
 
 
-def half_turn(angle: float) -> float:
+def wrap_angle(angle: float) -> float:
     """Bring an angle (rad) within half a turn to either side."""
     return math.remainder(angle, 2.0 * math.pi)
 

@@ -58,7 +58,7 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-class Access:
+class AccessControl:
     """An ASGI application that passes only permitted requests on to another.
 
     Args:

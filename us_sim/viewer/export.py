@@ -1,8 +1,8 @@
 """Files of a page's pictures and images: videos and DICOM.
 
->>> from us_sim.viewer.export import exported
+>>> from us_sim.viewer.export import export_frames
 >>> header = {"rows": 2, "columns": 3, "encoding": "mono8", "stamp": "0", "mode": "B-mode"}
->>> exported("dcm", [(header, bytes(6))])[128:132]
+>>> export_frames("dcm", [(header, bytes(6))])[128:132]
 b'DICM'
 """
 
@@ -36,7 +36,7 @@ _SIMULATED = "Simulated ultrasound, computed by us_sim: not an image of a patien
 _TWO_D, _TISSUE, _CENTIMETRES = 1, 1, 3  # PS3.3 C.8.5.5.1
 
 
-def frames_of(message: bytes) -> list[Sent]:
+def decode_frames(message: bytes) -> list[Sent]:
     """The frames of a page's message, which is a `Packet`: headers with ``bytes``, and payloads.
 
     Raises:
@@ -44,7 +44,7 @@ def frames_of(message: bytes) -> list[Sent]:
     """
     frames: list[Sent] = []
     try:
-        packet = Packet.decoded(message)
+        packet = Packet.from_bytes(message)
         payload = packet.payload
         for header in packet.header["frames"]:
             size = int(header["bytes"])
@@ -57,7 +57,7 @@ def frames_of(message: bytes) -> list[Sent]:
     return frames
 
 
-def exported(kind: str, frames: Sequence[Sent]) -> bytes:
+def export_frames(kind: str, frames: Sequence[Sent]) -> bytes:
     """The file of a kind (``mp4``, ``dcm``) that holds these frames.
 
     Raises:

@@ -28,12 +28,12 @@ from us_sim.nodes.guarded_node import GuardedNode, Subscriptions
 from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.recording.decoding import (
     affine_from,
-    first_stamp_in,
     line_from,
     mesh_from,
     nanoseconds_of,
     pixels_from,
     pose_from,
+    read_first_stamp,
     tetrahedra_from,
     triangles_from,
     vectors_from,
@@ -41,14 +41,14 @@ from us_sim.recording.decoding import (
 )
 from us_sim.slicing.settings import STRIPS
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
-from us_sim.viewer.stream import Feed, Packet, Posted
+from us_sim.viewer.stream import CallPoster, Feed, Packet
 from us_sim.viewer.surfaces import (
     CarriedSurfaces,
     ColouredSurface,
     EquivalentStrain,
-    RestSurface,
-    transducer_packet,
-    welded,
+    StreamedSurface,
+    make_transducer_packet,
+    weld_corners,
 )
 
 _QUALITY = 90  # of JPEG: 512 × 512 pixels of speckle are 60 kB then, a quarter of what they were
@@ -61,7 +61,7 @@ Make = Callable[[Any, int], Packet | None]
 """The packet of a message and a number; None while none can be made."""
 
 
-def made_of(
+def make_from_message(
     node: GuardedNode, message_type: Any, topic: str, data: bytes, make: Callable[[Any], Any]
 ) -> Any:
     """The result of ``make`` for a message's bytes; None, and reported, where it refuses them."""
@@ -69,12 +69,12 @@ def made_of(
     def made() -> Any:
         return make(deserialize_message(data, message_type))
 
-    return node.guarded(node.resolve_topic_name(topic), made)()
+    return node.guard_callback(node.resolve_topic_name(topic), made)()
 
 
-def topic_feed(
+def make_topic_feed(
     node: GuardedNode,
-    post: Posted,
+    post: CallPoster,
     message_type: Any,
     topic: str,
     make: Make,
@@ -94,17 +94,19 @@ def topic_feed(
     """
 
     def offer(data: bytes) -> None:
-        feed.offer(lambda n: made_of(node, message_type, topic, data, lambda m: make(m, n)))
+        feed.offer_packet(
+            lambda n: make_from_message(node, message_type, topic, data, lambda m: make(m, n))
+        )
 
     subscription = Subscriptions(node, (message_type, topic, offer, qos, True))
     # As it is once that is done: the page may have gone meanwhile.
-    feed = Feed(kind, lambda _: post(lambda: subscription.keep(feed.is_watched)), rate)
+    feed = Feed(kind, lambda _: post(lambda: subscription.set_active(feed.is_watched)), rate)
     return feed
 
 
-def image_feeds(
+def make_image_feeds(
     node: GuardedNode,
-    post: Posted,
+    post: CallPoster,
     rate: float,
     known: Callable[[int], dict[str, Any]] = lambda _: {},
     arranged: Callable[[], tuple[bool, bool]] = lambda: (False, False),
@@ -145,7 +147,7 @@ def image_feeds(
         return tell
 
     def images(topic: str, kind: str, make: Make) -> Feed:
-        return topic_feed(node, post, Image, topic, make, kind, rate)
+        return make_topic_feed(node, post, Image, topic, make, kind, rate)
 
     annotated = partial(_colour_jpeg, "annotated")
     return [
@@ -198,7 +200,7 @@ def _stamp(message: Any) -> str:
     return str(nanoseconds_of(message.header.stamp))
 
 
-def surfaces_of(message: MarkerArray, frame: str) -> list[ColouredSurface]:
+def read_surfaces(message: MarkerArray, frame: str) -> list[ColouredSurface]:
     """One surface of each namespace, with shared vertices.
 
     Raises:
@@ -207,7 +209,7 @@ def surfaces_of(message: MarkerArray, frame: str) -> list[ColouredSurface]:
     """
     surfaces = []
     for name, colour, corners in triangles_from(message, frame):
-        vertices, triangles = welded(corners)
+        vertices, triangles = weld_corners(corners)
         if len(triangles):
             surfaces.append(ColouredSurface(name, colour, vertices, triangles))
     return surfaces
@@ -216,7 +218,7 @@ def surfaces_of(message: MarkerArray, frame: str) -> list[ColouredSurface]:
 class ProbeFeeds:
     """The streams ``probe_mesh``, of ``probe/marker``, and ``probe``, of pose and wrench."""
 
-    def __init__(self, node: GuardedNode, post: Posted, rate: float) -> None:
+    def __init__(self, node: GuardedNode, post: CallPoster, rate: float) -> None:
         self._feed = Feed("probe", lambda _: post(self._listen), rate)
         # By stamp, ns, until its image is made.
         self._poses: dict[str, dict[str, Any]] = {}
@@ -226,12 +228,12 @@ class ProbeFeeds:
             (PoseStamped, "probe/pose", self._on_pose, STREAM, False),
             (WrenchStamped, "probe/wrench", self._on_wrench, STREAM, False),
         )
-        told = topic_feed(
+        told = make_topic_feed(
             node, post, MarkerArray, "probe/marker", _shape, "probe_mesh", None, LATCHED
         )
         self.feeds: list[Feed] = [told, self._feed]
 
-    def at(self, stamp: str) -> dict[str, Any]:
+    def find_pose_and_wrench(self, stamp: str) -> dict[str, Any]:
         """Position, quaternion, force and torque of a stamp, ns, as far as they are known.
 
         They are not while nobody watches the stream ``probe``.
@@ -239,7 +241,7 @@ class ProbeFeeds:
         return self._poses.get(stamp, {}) | self._forces.get(stamp, {})
 
     def _listen(self) -> None:
-        if self._subscriptions.keep(self._feed.is_watched) and self._feed.is_watched:
+        if self._subscriptions.set_active(self._feed.is_watched) and self._feed.is_watched:
             self._forces.clear()  # of the time before
 
     def _on_pose(self, message: PoseStamped) -> None:
@@ -263,7 +265,7 @@ class ProbeFeeds:
             of_force, force = next(reversed(self._forces.items()))
             age = round(1e-9 * (int(stamp) - int(of_force)), 3)
             header |= force | {"force_stamp": of_force, "force_age": age}
-        self._feed.offer(lambda sequence: Packet("probe", sequence, header, b""))
+        self._feed.offer_packet(lambda sequence: Packet("probe", sequence, header, b""))
 
 
 def _keep(kept: dict[Any, Any], key: Any, value: Any, most: int) -> None:
@@ -275,38 +277,38 @@ def _keep(kept: dict[Any, Any], key: Any, value: Any, most: int) -> None:
 
 
 def _shape(message: MarkerArray, sequence: int) -> Packet:
-    parts = surfaces_of(message, "probe")
-    return transducer_packet("probe_mesh", sequence, parts, line_from(message, "probe"))
+    parts = read_surfaces(message, "probe")
+    return make_transducer_packet("probe_mesh", sequence, parts, line_from(message, "probe"))
 
 
 class SkinFeeds:
     """The streams ``skin_mesh``, of ``skin/mesh``, and ``skin``, of ``skin/nodes``."""
 
-    def __init__(self, node: GuardedNode, post: Posted, rate: float) -> None:
-        self._surface: RestSurface | None = None
+    def __init__(self, node: GuardedNode, post: CallPoster, rate: float) -> None:
+        self._surface: StreamedSurface | None = None
         self.feeds: list[Feed] = [
-            topic_feed(node, post, Mesh, "skin/mesh", self._tell, "skin_mesh", None, LATCHED),
-            topic_feed(node, post, PointCloud2, "skin/nodes", self._move, "skin", rate),
+            make_topic_feed(node, post, Mesh, "skin/mesh", self._tell, "skin_mesh", None, LATCHED),
+            make_topic_feed(node, post, PointCloud2, "skin/nodes", self._move, "skin", rate),
         ]
 
     def _tell(self, message: Mesh, sequence: int) -> Packet:
-        self._surface = RestSurface(*mesh_from(message))
-        return self._surface.told("skin_mesh", sequence)
+        self._surface = StreamedSurface(*mesh_from(message))
+        return self._surface.make_rest_packet("skin_mesh", sequence)
 
     def _move(self, message: PointCloud2, sequence: int) -> Packet | None:
         return _moved(self._surface, message, "skin", sequence)
 
 
 def _moved(
-    surface: RestSurface | None, message: PointCloud2, kind: str, sequence: int
+    surface: StreamedSurface | None, message: PointCloud2, kind: str, sequence: int
 ) -> Packet | None:
     if surface is None:
         return None
     positions, stamp = vectors_from(message, "patient"), nanoseconds_of(message.header.stamp)
-    return surface.moved(positions, kind=kind, sequence=sequence, stamp=stamp)
+    return surface.make_packet(positions, kind=kind, sequence=sequence, stamp=stamp)
 
 
-class RestMesh:
+class RestMeshListener:
     """The tissue's mesh of ``tissue/rest`` and ``tissue/tetrahedra``, subscribed to while used.
 
     One serves all who work with the mesh, in the node's thread.
@@ -326,9 +328,9 @@ class RestMesh:
         self._rest: PointCloud2 | None = None
         self._tetrahedra: Int32MultiArray | None = None
         self.mesh: TetrahedralMesh | None = None
-        self.surface: RestSurface | None = None  # its outer faces, with their edges
+        self.surface: StreamedSurface | None = None  # its outer faces, with their edges
 
-    def watch(self, came: Callable[[], None], is_wanted: bool = True) -> None:
+    def set_watcher(self, came: Callable[[], None], is_wanted: bool = True) -> None:
         """Have ``came`` called when there is another mesh, or no longer.
 
         The mesh that is there is kept, and nobody is called for it.
@@ -339,7 +341,7 @@ class RestMesh:
             self._watchers.append(came)
         else:
             self._watchers.remove(came)
-        self._subscriptions.keep(bool(self._watchers))
+        self._subscriptions.set_active(bool(self._watchers))
 
     def _take_rest(self, message: PointCloud2) -> None:
         self._rest = message
@@ -363,18 +365,20 @@ class RestMesh:
                 f"{tetrahedra.max(initial=-1) + 1}: the two are not of the same mesh"
             )
         mesh = TetrahedralMesh(nodes, tetrahedra)
-        surface = RestSurface.around(mesh)
+        surface = StreamedSurface.from_mesh(mesh)
         if self.surface is not None and surface.number == self.surface.number:
             return
         self.mesh, self.surface = mesh, surface
         for came in list(self._watchers):
-            self._node.guarded(self._node.resolve_topic_name("tissue/rest"), came)()
+            self._node.guard_callback(self._node.resolve_topic_name("tissue/rest"), came)()
 
 
 class TissueFeeds:
     """The streams ``tissue_mesh``, ``tissue`` and ``strain``, of ``tissue/…``."""
 
-    def __init__(self, node: GuardedNode, post: Posted, rate: float, rest: RestMesh) -> None:
+    def __init__(
+        self, node: GuardedNode, post: CallPoster, rate: float, rest: RestMeshListener
+    ) -> None:
         self._rest = rest
         self._number: int | None = None  # of the mesh that was told
         self._strain: tuple[TetrahedralMesh, EquivalentStrain] | None = None
@@ -382,20 +386,24 @@ class TissueFeeds:
         strain_rate = min(rate, _STRAIN_RATE)
         self.feeds: list[Feed] = [
             self._told,
-            topic_feed(node, post, PointCloud2, _NODES, self._move, "tissue", rate),
-            topic_feed(node, post, PointCloud2, _NODES, self._be_strained, "strain", strain_rate),
+            make_topic_feed(node, post, PointCloud2, _NODES, self._move, "tissue", rate),
+            make_topic_feed(
+                node, post, PointCloud2, _NODES, self._be_strained, "strain", strain_rate
+            ),
         ]
 
     def _listen(self) -> None:
         """Hear of meshes while a page watches; one may be there already."""
-        self._rest.watch(self._offer, self._told.is_watched)
+        self._rest.set_watcher(self._offer, self._told.is_watched)
         self._offer()
 
     def _offer(self) -> None:
         surface = self._rest.surface
         if surface is not None and surface.number != self._number:
             self._number = surface.number
-            self._told.offer(lambda sequence: surface.told("tissue_mesh", sequence))
+            self._told.offer_packet(
+                lambda sequence: surface.make_rest_packet("tissue_mesh", sequence)
+            )
 
     def _move(self, message: PointCloud2, sequence: int) -> Packet | None:
         return _moved(self._rest.surface, message, "tissue", sequence)
@@ -410,7 +418,7 @@ class TissueFeeds:
         if nodes.shape != mesh.nodes.shape:
             raise MeshError(f"{len(nodes)} nodes came, and the mesh has {len(mesh.nodes)}")
         header = {"stamp": _stamp(message), "mesh": surface.number, "points": len(nodes)}
-        values = self._strain[1].of(nodes).astype(np.float32)
+        values = self._strain[1].compute_strain(nodes).astype(np.float32)
         return Packet("strain", sequence, header, values.tobytes())
 
 
@@ -422,7 +430,7 @@ class StructuresFeed:
     tissue each vertex lies, and the page moves the structures with the tissue.
     """
 
-    def __init__(self, node: GuardedNode, post: Posted, rest: RestMesh) -> None:
+    def __init__(self, node: GuardedNode, post: CallPoster, rest: RestMeshListener) -> None:
         self._node, self._post, self._rest = node, post, rest
         self.feed = Feed("structures", lambda _: post(self._listen), rate=None)
         self._subscriptions = Subscriptions(
@@ -435,25 +443,25 @@ class StructuresFeed:
         self._made_for: int | None = None  # the number of the mesh
         self._making: threading.Thread | None = None
 
-    def forget(self) -> None:
+    def forget_structures(self) -> None:
         """Drop those of a scene that another has taken the place of, if on the same mesh."""
         self._made_for = None
-        self.feed.forget()
+        self.feed.forget_packet()
         self._listen()
 
     def _listen(self) -> None:
         """Hear of meshes while watched, and of the rest until it has been used."""
-        self._rest.watch(self._listen, self.feed.is_watched)
+        self._rest.set_watcher(self._listen, self.feed.is_watched)
         surface = self._rest.surface
         is_new = surface is not None and surface.number != self._made_for
         if is_new:
-            self.feed.forget()  # the tissue that carried them is of another scene
-        if self._subscriptions.keep(self.feed.is_watched and is_new and self._making is None):
+            self.feed.forget_packet()  # the tissue that carried them is of another scene
+        if self._subscriptions.set_active(self.feed.is_watched and is_new and self._making is None):
             self._nodes.clear()
             self._structures = None
 
     def _take_nodes(self, data: bytes) -> None:
-        stamp = made_of(
+        stamp = make_from_message(
             self._node, PointCloud2, _NODES, data, lambda m: nanoseconds_of(m.header.stamp)
         )
         if stamp is not None:
@@ -461,7 +469,7 @@ class StructuresFeed:
             self._try()
 
     def _take_structures(self, data: bytes) -> None:
-        stamp = first_stamp_in(data)
+        stamp = read_first_stamp(data)
         if stamp is not None:
             self._structures = stamp, data
             self._try()
@@ -483,17 +491,19 @@ class StructuresFeed:
 
     def _make(self, mesh: TetrahedralMesh, number: int, nodes: bytes, structures: bytes) -> None:
         def carried_by(message: MarkerArray) -> CarriedSurfaces:
-            surfaces = surfaces_of(message, "patient")
+            surfaces = read_surfaces(message, "patient")
             if not surfaces:
                 raise MeshError("there is no triangle in it")
             return CarriedSurfaces(TetrahedralMesh(deformed, mesh.tetrahedra), surfaces)
 
-        deformed = made_of(
+        deformed = make_from_message(
             self._node, PointCloud2, _NODES, nodes, lambda m: vectors_from(m, "patient")
         )
         carried = None
         if deformed is not None:
-            carried = made_of(self._node, MarkerArray, _STRUCTURES, structures, carried_by)
+            carried = make_from_message(
+                self._node, MarkerArray, _STRUCTURES, structures, carried_by
+            )
         self._post(lambda: self._end(number, carried, is_wrong=deformed is not None))
 
     def _end(self, number: int, carried: CarriedSurfaces | None, is_wrong: bool) -> None:
@@ -503,5 +513,7 @@ class StructuresFeed:
             self._made_for = number
         surface = self._rest.surface
         if carried is not None and surface is not None and surface.number == number:
-            self.feed.offer(lambda sequence: carried.told("structures", sequence, number))
+            self.feed.offer_packet(
+                lambda sequence: carried.make_rest_packet("structures", sequence, number)
+            )
         self._listen()

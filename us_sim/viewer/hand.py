@@ -24,11 +24,18 @@ from us_sim.nodes.scene_node import LEAD_TOPIC
 from us_sim.nodes.settings import PLAYERS
 from us_sim.recording.decoding import mesh_from, pose_from, pose_from_text
 from us_sim.tracking.measurement import PATIENT, TrackingState
-from us_sim.tracking.virtual_hand import DEEPEST, HIGHEST, STEEPEST, Motion, RestSurface, Stance
-from us_sim.viewer.feeds import RestMesh
+from us_sim.tracking.virtual_hand import (
+    DEEPEST,
+    HIGHEST,
+    STEEPEST,
+    Stance,
+    StanceMotion,
+    StandingSurface,
+)
+from us_sim.viewer.feeds import RestMeshListener
 from us_sim.viewer.hand_command import HOME_PRESS, SINGLE, HandCommand, is_source
 from us_sim.viewer.session import SessionState
-from us_sim.viewer.stream import Feed, Packet, Posted, Simulator
+from us_sim.viewer.stream import CallPoster, Feed, Packet, Simulator
 
 MOVING_HZ = 60.0 if (os.cpu_count() or 1) > 2 else 30.0
 """Poses a second: on two cores the simulator and the browser share them, and a page shows no more
@@ -49,7 +56,7 @@ _HELD = "another page holds the probe: Take over moves it to this one"
 
 
 @dataclass(frozen=True)
-class Lead:
+class ProbeLead:
     """Who leads, and whether a page's hand may."""
 
     who: str  # a node, "tracker" for the scene's own, "hand", or "nobody"
@@ -57,7 +64,7 @@ class Lead:
     can_take: bool = False  # whether a page can end what moves it
 
 
-def find_lead(node: GuardedNode, session: SessionState, *, is_publishing: bool) -> Lead:
+def find_lead(node: GuardedNode, session: SessionState, *, is_publishing: bool) -> ProbeLead:
     """Find out who moves the probe, by who publishes and hears ``tracker/pose``.
 
     Args:
@@ -75,19 +82,21 @@ def find_lead(node: GuardedNode, session: SessionState, *, is_publishing: bool) 
             what = "has ended"
             what += " and holds the probe" if others[0] == PLAYERS[0] else ""
         obstacle = f"the replay of {PurePath(session.replay).name} {what}"
-        return Lead(others[0], obstacle, can_take=True)
+        return ProbeLead(others[0], obstacle, can_take=True)
     if others:
-        return Lead(others[0], f"{others[0]} moves the probe: end it to take the probe yourself")
+        return ProbeLead(
+            others[0], f"{others[0]} moves the probe: end it to take the probe yourself"
+        )
     hearers = [info.node_name for info in node.get_subscriptions_info_by_topic(name)]
     if "probe_tracker" in hearers:
-        return Lead("hand")
+        return ProbeLead("hand")
     if _is_offered(node, "probe/pose"):
-        return Lead(
+        return ProbeLead(
             "tracker",
             "the probe follows the scene's own tracker: start without --tracker, or with --param "
             "probe_tracker.source=pose, to take it yourself",
         )
-    return Lead("nobody", "no simulator with a probe runs yet")
+    return ProbeLead("nobody", "no simulator with a probe runs yet")
 
 
 def _is_offered(node: GuardedNode, topic: str) -> bool:
@@ -102,22 +111,24 @@ class PatientSurface:
         rest: the tissue's mesh.
     """
 
-    def __init__(self, node: GuardedNode, rest: RestMesh) -> None:
+    def __init__(self, node: GuardedNode, rest: RestMeshListener) -> None:
         self._node, self._rest = node, rest
-        self._skin: RestSurface | None = None
-        self._tissue: RestSurface | None = None
-        self._plane = RestSurface.plane(0.1)  # m around the origin
+        self._skin: StandingSurface | None = None
+        self._tissue: StandingSurface | None = None
+        self._plane = StandingSurface.create_plane(0.1)  # m around the origin
         self._meshes = Subscriptions(node, (Mesh, "skin/mesh", self._on_skin, LATCHED, False))
 
-    def listen(self, is_wanted: bool) -> None:
+    def follow_meshes(self, is_wanted: bool) -> None:
         """Follow the meshes, or no longer."""
         self._skin = self._tissue = None
-        self._meshes.keep(is_wanted)
-        self._rest.watch(self._on_tissue, is_wanted)
+        self._meshes.set_active(is_wanted)
+        self._rest.set_watcher(self._on_tissue, is_wanted)
         if is_wanted:
-            self._node.guarded(self._node.resolve_topic_name("tissue/rest"), self._on_tissue)()
+            self._node.guard_callback(
+                self._node.resolve_topic_name("tissue/rest"), self._on_tissue
+            )()
 
-    def find(self) -> RestSurface | None:
+    def find_surface(self) -> StandingSurface | None:
         """Return the surface to stand on; None while one is still awaited."""
         is_skin_offered = _is_offered(self._node, "skin/mesh")
         if self._skin is not None and (self._tissue is None or is_skin_offered):
@@ -128,11 +139,13 @@ class PatientSurface:
         return None if is_awaited else self._plane
 
     def _on_skin(self, message: Mesh) -> None:
-        self._skin = RestSurface(*mesh_from(message))
+        self._skin = StandingSurface(*mesh_from(message))
 
     def _on_tissue(self) -> None:
         if self._rest.mesh is not None:
-            self._tissue = RestSurface.upper_side(self._rest.mesh.nodes, self._rest.mesh.boundary)
+            self._tissue = StandingSurface.create_upper_side(
+                self._rest.mesh.nodes, self._rest.mesh.boundary
+            )
 
 
 class HandState(Enum):
@@ -144,7 +157,7 @@ class HandState(Enum):
     MOVING = "it holds the probe, which moves, or is imaged as if it did"
 
     @property
-    def holds(self) -> bool:
+    def holds_probe(self) -> bool:
         """Whether the hand publishes the probe's poses."""
         return self in (HandState.RESTING, HandState.MOVING)
 
@@ -166,19 +179,19 @@ class ViewerHand:
     """
 
     def __init__(
-        self, node: GuardedNode, post: Posted, simulator: Simulator, rest: RestMesh
+        self, node: GuardedNode, post: CallPoster, simulator: Simulator, rest: RestMeshListener
     ) -> None:
         self._node, self._post, self._simulator = node, post, simulator
         # To a person's eye sliders follow at 10 Hz, and more would take time from the image.
         self.feed = Feed("hand", lambda _: post(self._on_watch), 10.0)
-        simulator.add(self.feed)
+        simulator.add_feeds(self.feed)
         simulator.commands |= {"hand": self._on_command, "take": self._on_take}
         simulator.leaving.append(self._on_leave)
         self._state = HandState.IDLE
-        self._lead = Lead("nobody", "the viewer finds out who moves the probe")
+        self._lead = ProbeLead("nobody", "the viewer finds out who moves the probe")
         self._surface = PatientSurface(node, rest)
-        self._standing: RestSurface | None = None  # the surface that the motion is on
-        self._motion: Motion | None = None
+        self._standing: StandingSurface | None = None  # the surface that the motion is on
+        self._motion: StanceMotion | None = None
         self._publisher: Any = None
         self._subscriptions = Subscriptions(
             node,
@@ -201,7 +214,7 @@ class ViewerHand:
         self._timer = node.create_timer(1.0 / RESTING_HZ, self._on_timer)
         self._timer.cancel()
 
-    def pose_facts(self, stamp: int, position: ArrayLike | None) -> dict[str, Any]:
+    def describe_pose(self, stamp: int, position: ArrayLike | None) -> dict[str, Any]:
         """Describe the pose of an image; any thread may ask.
 
         Args:
@@ -214,7 +227,7 @@ class ViewerHand:
         """
         press, wish = self._published.get(stamp, (None, None))
         if press is None and self._standing is not None and position is not None:
-            press = self._standing.under(np.asarray(position, dtype=np.float64))[1]
+            press = self._standing.find_foot(np.asarray(position, dtype=np.float64))[1]
         return {"press": press, "command": wish}
 
     def _enter(self, state: HandState) -> None:
@@ -223,15 +236,15 @@ class ViewerHand:
         is_watched = state is not HandState.IDLE
         if is_watched != (before is not HandState.IDLE):
             session = self._simulator.session
-            (session.watch if is_watched else session.unwatch)()
-            self._surface.listen(is_watched)
-            self._subscriptions.keep(is_watched)
+            (session.add_page if is_watched else session.remove_page)()
+            self._surface.follow_meshes(is_watched)
+            self._subscriptions.set_active(is_watched)
             self._is_found = False
-        if state.holds and not before.holds:
+        if state.holds_probe and not before.holds_probe:
             self._take_probe()
-        elif before.holds and not state.holds:
+        elif before.holds_probe and not state.holds_probe:
             assert self._motion is not None
-            self._motion = Motion(self._motion.stance)
+            self._motion = StanceMotion(self._motion.stance)
             self._node.destroy_publisher(self._publisher)
             self._warning = ""
         rate = 2.0 * MOVING_HZ if state is HandState.MOVING else RESTING_HZ
@@ -242,11 +255,11 @@ class ViewerHand:
         """Hold it from where it is, or else where it was held, or at home."""
         assert self._standing is not None
         if self._elsewhere is not None:
-            self._motion = Motion(Stance.of(self._elsewhere, self._standing))
+            self._motion = StanceMotion(Stance.from_pose(self._elsewhere, self._standing))
             self._elsewhere = None
         elif self._motion is None:
-            self._motion = Motion(Stance.home(self._standing, HOME_PRESS))
-        self._publisher = self._node.stream(PoseStamped, LEAD_TOPIC)
+            self._motion = StanceMotion(Stance.create_home(self._standing, HOME_PRESS))
+        self._publisher = self._node.create_stream_publisher(PoseStamped, LEAD_TOPIC)
         self._moved_at = self._held_at = time.monotonic()
 
     def _on_watch(self) -> None:
@@ -272,7 +285,7 @@ class ViewerHand:
         self._stand()
         self._lead = self._find_lead()
         if self._lead.obstacle:
-            if self._state.holds:
+            if self._state.holds_probe:
                 self._enter(HandState.WAITING)
             self._tell()
             return
@@ -283,32 +296,32 @@ class ViewerHand:
             if self._simulator.is_changing_by_itself:
                 self._enter(HandState.MOVING)
 
-    def _find_lead(self) -> Lead:
+    def _find_lead(self) -> ProbeLead:
         """Find out who moves the probe; the hand, if there is also somewhere to begin."""
         session = self._simulator.session.state
-        lead = find_lead(self._node, session, is_publishing=self._state.holds)
+        lead = find_lead(self._node, session, is_publishing=self._state.holds_probe)
         if lead.obstacle:
             return lead
         if self._standing is None:
-            return Lead("nobody", "the patient's surface is awaited")
+            return ProbeLead("nobody", "the patient's surface is awaited")
         if not self._is_found and _is_offered(self._node, "probe/status"):
-            return Lead("nobody", "the viewer finds out where the probe is")
+            return ProbeLead("nobody", "the viewer finds out where the probe is")
         return lead
 
     def _stand(self) -> None:
         """Stand on another surface: where the probe is, if that is near, else at home."""
-        surface = self._surface.find()
+        surface = self._surface.find_surface()
         if surface is None or surface is self._standing:
             return
         self._standing = surface
         if self._motion is None:
             return
         stance = self._motion.stance
-        foot = surface.closest(stance.point)
+        foot = surface.find_closest(stance.point)
         if float(np.linalg.norm(foot.point - stance.point)) < SAME_PATIENT:
-            self._motion = Motion(replace(stance, point=foot.point))
+            self._motion = StanceMotion(replace(stance, point=foot.point))
         else:
-            self._motion = Motion(Stance.home(surface, HOME_PRESS))
+            self._motion = StanceMotion(Stance.create_home(surface, HOME_PRESS))
 
     def _on_status(self, status: DiagnosticStatus) -> None:
         """Learn where the probe was when poses ended; there it is unless this hand has had it."""
@@ -316,7 +329,7 @@ class ViewerHand:
         if "pose" in said:
             pose = pose_from_text(said["pose"])
             own = str(next(reversed(self._published), None))
-            if not self._state.holds and said.get("stamp") != own:
+            if not self._state.holds_probe and said.get("stamp") != own:
                 self._elsewhere = pose
         elif status.message != TrackingState.WAITING.value:  # poses come
             self._is_found |= self._motion is not None
@@ -329,12 +342,12 @@ class ViewerHand:
         """Follow the probe while others have it; warn where it is not where the hand has put it."""
         pose = pose_from(message, PATIENT)
         now = self._followed_at = time.monotonic()
-        if not self._state.holds:
+        if not self._state.holds_probe:
             self._elsewhere, self._is_found = pose, True
         elif not self._warning and now - self._moved_at > SETTLED:
             assert self._motion is not None
             assert self._standing is not None
-            wanted = self._motion.stance.pose(self._standing).position
+            wanted = self._motion.stance.compute_pose(self._standing).position
             distance = float(np.linalg.norm(pose.position - wanted))
             if distance > ASTRAY:
                 self._warning = (
@@ -360,7 +373,7 @@ class ViewerHand:
     def _on_take(self, page: Any, connection: int) -> str | None:
         """Let a page hold the probe, whichever held it; a replay that moves it ends."""
         if self._lead.can_take:
-            self._simulator.session.ask(replay="")
+            self._simulator.session.ask_control(replay="")
         elif self._lead.obstacle:
             return self._lead.obstacle
         if is_source(page):
@@ -373,11 +386,11 @@ class ViewerHand:
 
     def _obey(self, asked: HandCommand) -> None:
         """Move to where a page wants the probe, from now on."""
-        if not self._state.holds:
+        if not self._state.holds_probe:
             return  # somebody else has taken it meanwhile
         assert self._motion is not None
         assert self._standing is not None
-        self._motion.aim(asked.stance(self._motion.goal, self._standing))
+        self._motion.aim_at(asked.change_stance(self._motion.goal, self._standing))
         self._wish, self._asked_at = (asked.source, asked.sequence), time.monotonic()
         if self._state is HandState.RESTING:
             self._enter(HandState.MOVING)
@@ -401,25 +414,25 @@ class ViewerHand:
         assert self._standing is not None
         stamp = self._node.get_clock().now()
         stance = self._motion.stance
-        pose = stance.pose(self._standing)
+        pose = stance.compute_pose(self._standing)
         # Kept first: its image may be there at once.
         self._published[stamp.nanoseconds] = stance.press, self._wish
         if len(self._published) > _KEPT:
             del self._published[next(iter(self._published))]
         self._publisher.publish(pose_message(pose, stamp.to_msg(), PATIENT))
         self._sent_at = time.monotonic()
-        self._node.health.published(LEAD_TOPIC)
+        self._node.health.count_published(LEAD_TOPIC)
         self._tell()
 
     def _tell(self) -> None:
         """Tell the pages how the probe is held, and by whom."""
         motion, surface = self._motion, self._standing
         stance, goal = (motion.stance, motion.goal) if motion is not None else (None, None)
-        if not self._state.holds and self._elsewhere is not None and surface is not None:
-            stance = goal = Stance.of(self._elsewhere, surface)
+        if not self._state.holds_probe and self._elsewhere is not None and surface is not None:
+            stance = goal = Stance.from_pose(self._elsewhere, surface)
         silent = time.monotonic() - max(self._followed_at, self._held_at)
         warning = self._warning
-        if self._state.holds and silent > UNANSWERED:
+        if self._state.holds_probe and silent > UNANSWERED:
             warning = (
                 f"The simulator does not answer: the probe has not followed for {silent:.0f} s"
             )
@@ -436,10 +449,10 @@ class ViewerHand:
             header["range"] = _range(surface)
         if stance is not None and goal is not None:
             header |= {"stance": _numbers(stance), "goal": _numbers(goal)}
-        self.feed.offer(lambda sequence: Packet("hand", sequence, header, b""))
+        self.feed.offer_packet(lambda sequence: Packet("hand", sequence, header, b""))
 
 
-def _range(surface: RestSurface) -> dict[str, list[float]]:
+def _range(surface: StandingSurface) -> dict[str, list[float]]:
     """Return where the probe may be, m and rad, frame ``patient``."""
     lower, upper = surface.lower.tolist(), surface.upper.tolist()
     place = {"x": [lower[0], upper[0]], "y": [lower[1], upper[1]]}

@@ -2,7 +2,7 @@
 
 >>> from us_sim.tracking.virtual_hand import RestSurface, Stance
 >>> asked = HandCommand.read({"source": "a", "sequence": 7, "to": {"press": 0.004}})
->>> asked = asked.stance(Stance(rotation=0.1), RestSurface.plane(0.1))
+>>> asked = asked.change_stance(Stance(rotation=0.1), RestSurface.plane(0.1))
 >>> asked.press, asked.rotation
 (0.004, 0.1)
 """
@@ -17,8 +17,8 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from us_sim.errors import MessageError
-from us_sim.settings.spelling import shown
-from us_sim.tracking.virtual_hand import RestSurface, Stance
+from us_sim.settings.spelling import short_repr
+from us_sim.tracking.virtual_hand import Stance, StandingSurface
 
 HOME_PRESS = 1e-3  # m: where the probe begins it touches, so that there is an image
 LIFTED = -0.01  # m
@@ -51,17 +51,19 @@ class HandCommand:
         """
         known = {"source", "sequence", "to", "by", "go"}
         if not isinstance(value, dict) or not value.keys() <= known:
-            raise MessageError(f"{shown(value)} is no command to the hand: load the page again")
+            raise MessageError(
+                f"{short_repr(value)} is no command to the hand: load the page again"
+            )
         source, sequence, go = value.get("source"), value.get("sequence"), value.get("go")
         if not is_source(source):
-            raise MessageError(f"source: {shown(source)} names no page: load it again")
+            raise MessageError(f"source: {short_repr(source)} names no page: load it again")
         if type(sequence) is not int or not 0 <= sequence <= _LAST:
-            raise MessageError(f"sequence: {shown(sequence)} is no count: load the page again")
+            raise MessageError(f"sequence: {short_repr(sequence)} is no count: load the page again")
         if go not in (None, *_PLACES):
-            raise MessageError(f"go: {shown(go)} is none of {', '.join(_PLACES)}")
+            raise MessageError(f"go: {short_repr(go)} is none of {', '.join(_PLACES)}")
         return cls(source, sequence, _numbers(value, "to"), _numbers(value, "by"), go)
 
-    def stance(self, goal: Stance, surface: RestSurface) -> Stance:
+    def change_stance(self, goal: Stance, surface: StandingSurface) -> Stance:
         """Return the stance that is wanted now, within a hand's limits.
 
         Args:
@@ -69,7 +71,7 @@ class HandCommand:
             surface: that the probe stands on.
         """
         if self.go == "home":
-            goal = Stance.home(surface, HOME_PRESS)
+            goal = Stance.create_home(surface, HOME_PRESS)
         elif self.go == "lift":
             goal = replace(goal, press=LIFTED)
         elif self.go == "upright":
@@ -77,14 +79,14 @@ class HandCommand:
         wanted: dict[str, Any] = {name: n[0] for name, n in self.to.items() if name in SINGLE}
         goal = replace(goal, **wanted)
         if "point" in self.to:
-            goal = replace(goal, point=surface.closest(np.array(self.to["point"])).point)
+            goal = replace(goal, point=surface.find_closest(np.array(self.to["point"])).point)
         if "x" in self.to or "y" in self.to:
             x, y = (self.to.get(name, (goal.point[axis],))[0] for axis, name in enumerate("xy"))
-            goal = replace(goal, point=surface.above(x, y).point)
+            goal = replace(goal, point=surface.find_top(x, y).point)
         if "slide" in self.by:
-            goal = goal.slid(surface, *self.by["slide"])
+            goal = goal.slide_along(surface, *self.by["slide"])
         changed = {n: getattr(goal, n) + self.by[n][0] for n in SINGLE if n in self.by}
-        return replace(goal, **changed).within_reach()
+        return replace(goal, **changed).clip_to_reach()
 
 
 def is_source(value: Any) -> TypeGuard[str]:
@@ -96,7 +98,7 @@ def _numbers(value: dict[str, Any], key: str) -> dict[str, tuple[float, ...]]:
     """Read the numbers of one part of a command."""
     given, sizes = value.get(key, {}), _SIZES[key]
     if not isinstance(given, dict) or not given.keys() <= sizes.keys():
-        raise MessageError(f"{key}: {shown(given)} is no object of {', '.join(sizes)}")
+        raise MessageError(f"{key}: {short_repr(given)} is no object of {', '.join(sizes)}")
     numbers = {}
     for name, listed in given.items():
         values = listed if isinstance(listed, list) else [listed]
@@ -105,7 +107,7 @@ def _numbers(value: dict[str, Any], key: str) -> dict[str, tuple[float, ...]]:
             type(n) in (int, float) and abs(n) <= limit for n in values
         ):
             raise MessageError(
-                f"{name}: {shown(listed)} is not {sizes[name]} within ±{limit:.3g} {unit}"
+                f"{name}: {short_repr(listed)} is not {sizes[name]} within ±{limit:.3g} {unit}"
             )
         numbers[name] = tuple(map(float, values))
     return numbers

@@ -19,16 +19,16 @@ from nicegui import ui
 
 from us_sim.errors import UsSimError
 from us_sim.slicing.settings import OVERLAYS, STRIPS
-from us_sim.viewer.export import LARGEST, exported, frames_of
-from us_sim.viewer.panels.asking import is_taken, set_parameter, why_not
+from us_sim.viewer.export import LARGEST, decode_frames, export_frames
+from us_sim.viewer.panels.asking import find_refusal, is_taken, set_parameter
 from us_sim.viewer.panels.exercise import ExercisePanel
 from us_sim.viewer.panels.nodes import TISSUE, build_image, build_plots, build_status, build_tissue
 from us_sim.viewer.panels.session import CasesPanel, SessionPanel
-from us_sim.viewer.parameters import Kind
+from us_sim.viewer.parameters import ParameterKind
 from us_sim.viewer.remote_parameters import NodeParameters
-from us_sim.viewer.score import is_blind, told_score
+from us_sim.viewer.score import get_score, is_blind
 from us_sim.viewer.session import SessionState
-from us_sim.viewer.status import Watched
+from us_sim.viewer.status import PageCounter
 from us_sim.viewer.stream import PageStream, Simulator
 
 NODE, OVERLAY, FLIP, BESIDE = "slice_interpolator", "overlay", "flip", "beside"
@@ -71,18 +71,18 @@ class ModeBar:
         self._places: list[dict[str, Any]] = []
         with ui.row().classes("us-modes").props('role="toolbar" aria-label="Image modes"') as bar:
             for mode, (label, text) in MODES.items():
-                title = text if mode == "b-mode" else why_not() or text
+                title = text if mode == "b-mode" else find_refusal() or text
                 self._buttons[mode] = _button(label, title, lambda mode=mode: self._choose(mode))
             ui.element("span").classes("us-gap")
             for kind, (label, title, _) in STRIPS.items():
                 self._buttons[kind] = _button(label, title, lambda kind=kind: self._toggle(kind))
             for name, (label, text) in SWITCHES.items():
-                title = why_not() or text
+                title = find_refusal() or text
                 self._buttons[name] = _button(label, title, lambda name=name: self._switch(name))
         bar.on("us-place", lambda event: self._move(event.args.get("detail")), ["detail"])
         self._mark()
         self._remarks: list[str] = []
-        _watch_while_connected(simulator.nodes.of(NODE), simulator.status)
+        _watch_while_connected(simulator.nodes.get_node(NODE), simulator.status)
         ui.timer(0.3, self._refresh)
 
     async def _choose(self, mode: str) -> None:
@@ -97,15 +97,15 @@ class ModeBar:
 
     async def _set(self, name: str, value: object) -> bool:
         """Set a parameter; whether that was not refused."""
-        return is_taken(await set_parameter(self._simulator.nodes.of(NODE), name, value))
+        return is_taken(await set_parameter(self._simulator.nodes.get_node(NODE), name, value))
 
     @property
     def _overlay(self) -> Any:
-        parameter = self._simulator.nodes.of(NODE).parameters.get(OVERLAY)
+        parameter = self._simulator.nodes.get_node(NODE).parameters.get(OVERLAY)
         return parameter.raw if parameter else None
 
     def _is_on(self, name: str) -> bool:
-        parameter = self._simulator.nodes.of(NODE).parameters.get(name)
+        parameter = self._simulator.nodes.get_node(NODE).parameters.get(name)
         return parameter is not None and bool(parameter.raw)
 
     def _show(self, mode: str) -> None:
@@ -132,22 +132,22 @@ class ModeBar:
         known = self._overlay
         if self._mode != "b-mode" and known in MODES and known != self._mode:
             self._show(known)
-        hides = is_blind(told_score(self._simulator))
+        hides = is_blind(get_score(self._simulator))
         if hides and self._mode != "b-mode":
             self._show("b-mode")
         for name in (*MODES, BESIDE):
             self._buttons[name].set_visibility(not hides or name == "b-mode")
         for name in (*MODES, *SWITCHES):
-            self._buttons[name].set_enabled(not why_not() or name in ("b-mode", known))
+            self._buttons[name].set_enabled(not find_refusal() or name in ("b-mode", known))
         self._mark()
 
     def _wanted_remarks(self) -> list[str]:
         """Reasons why the images show little, for a person."""
-        status = self._simulator.status.node(NODE, time.monotonic())
+        status = self._simulator.status.find_node(NODE, time.monotonic())
         values = status.values if status else {}
         remarks = [_CONTACT.get(values.get("contact", ""), "")]
-        tissue = self._simulator.status.node(TISSUE, time.monotonic())
-        force = (tissue.number("force") if tissue else None) or 0.0
+        tissue = self._simulator.status.find_node(TISSUE, time.monotonic())
+        force = (tissue.read_number("force") if tissue else None) or 0.0
         if force > 20.0:  # N; sonographers press with some 5 to 10
             remarks.append(f"Too much force: {force:.0f} N")
         if tissue and tissue.values.get("problem") == "inside out":
@@ -160,8 +160,12 @@ class ModeBar:
 
     def _value(self, name: str) -> float | None:
         """A number of the node in SI units; None where there is none."""
-        parameter = self._simulator.nodes.of(NODE).parameters.get(name)
-        if parameter is None or parameter.kind is not Kind.NUMBER or parameter.value is None:
+        parameter = self._simulator.nodes.get_node(NODE).parameters.get(name)
+        if (
+            parameter is None
+            or parameter.kind is not ParameterKind.NUMBER
+            or parameter.value is None
+        ):
             return None
         return float(parameter.raw)
 
@@ -183,7 +187,7 @@ class ModeBar:
         wanted = asked if isinstance(asked, dict) else {}
         kind = wanted.get("kind")
         for name in ("lateral", "depth"):
-            parameter = self._simulator.nodes.of(NODE).parameters.get(f"{kind}.{name}")
+            parameter = self._simulator.nodes.get_node(NODE).parameters.get(f"{kind}.{name}")
             value = wanted.get(name)
             if parameter is None or kind not in ("colour", *STRIPS):
                 continue
@@ -219,16 +223,16 @@ def _absent(what: str, why: str, values: Mapping[str, str]) -> str:
     return f"{what}: {_ABSENT[why]}"
 
 
-def words_of(state: SessionState) -> tuple[str, str]:
+def describe_scene(state: SessionState) -> tuple[str, str]:
     """The scene's name and a remark on it, which is often empty.
 
-    >>> words_of(SessionState(is_there=True, scene="upper_arm", state="running"))
+    >>> describe_scene(SessionState(is_there=True, scene="upper_arm", state="running"))
     ('upper arm', '')
-    >>> words_of(SessionState(is_there=True, scene="upper_arm", state="starting", fraction=0.4))
+    >>> describe_scene(SessionState(is_there=True, scene="upper_arm", state="starting", fraction=0.4))
     ('upper arm', 'starting, 40 %')
     >>> replay = {"replay": "/home/a/press.mcap", "replay_state": "finished"}
     >>> record = {"record": "/home/a/b.mcap", "record_state": "recording"}
-    >>> words_of(SessionState(is_there=True, scene="upper_arm", **record, **replay))
+    >>> describe_scene(SessionState(is_there=True, scene="upper_arm", **record, **replay))
     ('upper arm', 'recording b.mcap · replay of press.mcap: finished')
     """
     name = state.scene.replace("_", " ")
@@ -249,12 +253,12 @@ def build_headline(simulator: Simulator) -> None:
     problem = ui.label().classes("us-headline us-wrong").props('role="alert"')
 
     def refresh() -> None:
-        scene, told = words_of(board.state)
+        scene, told = describe_scene(board.state)
         name.set_text(scene)
         if name.props.get("data-scene") != board.state.scene:
             name.props["data-scene"] = board.state.scene  # as the headers of images say it
             name.update()
-        known = (each.values.get("preparing", "") for each in nodes.nodes(time.monotonic()))
+        known = (each.values.get("preparing", "") for each in nodes.list_nodes(time.monotonic()))
         words.set_text(" · ".join(filter(None, (*known, told))))
         problem.set_text(board.state.problem)
 
@@ -262,7 +266,7 @@ def build_headline(simulator: Simulator) -> None:
     ui.timer(0.5, refresh)
 
 
-def _watch_while_connected(*shown: Watched | NodeParameters) -> None:
+def _watch_while_connected(*shown: PageCounter | NodeParameters) -> None:
     """Watch these from when the browser comes until it goes, also for a moment."""
     connections = 0
 
@@ -271,7 +275,7 @@ def _watch_while_connected(*shown: Watched | NodeParameters) -> None:
         before, connections = connections, connections + by
         if bool(before) != bool(connections):
             for each in shown:
-                (each.unwatch if before else each.watch)()
+                (each.remove_page if before else each.add_page)()
 
     ui.context.client.on_connect(lambda: change(1))
     ui.context.client.on_disconnect(lambda: change(-1))
@@ -333,7 +337,7 @@ def build_page(simulator: Simulator) -> None:
 
     def show_exercise() -> None:
         """Open its panel, once, when there is one and the window has room beside the 3D view."""
-        if told_score(simulator).get("steps"):
+        if get_score(simulator).get("steps"):
             asking.deactivate()
             tabs.set_value("Exercise")
             if not drawer.visible:
@@ -342,7 +346,7 @@ def build_page(simulator: Simulator) -> None:
 
     def hide_truth() -> None:
         """Leave out what tells of what there is to be found, while an exercise asks."""
-        hides = is_blind(told_score(simulator))
+        hides = is_blind(get_score(simulator))
         tissue.set_visibility(not hides)
         if hides and tabs.value == TISSUE_TAB:
             tabs.set_value("Exercise")
@@ -381,7 +385,7 @@ def _panels(simulator: Simulator) -> tuple[ui.tabs, ui.tab]:
 ASSETS = Path(__file__).parent / "assets"
 
 
-def application(simulator: Simulator) -> Any:
+def make_application(simulator: Simulator) -> Any:
     """The ASGI application of one viewer; a process has one."""
     # It warns of every path that is not there, as it was sent, with what a terminal obeys.
     logging.getLogger("nicegui").setLevel(logging.ERROR)
@@ -400,8 +404,8 @@ def application(simulator: Simulator) -> Any:
             if len(message) > LARGEST:
                 return Response("that is too much to be saved: save less", 413)
         try:
-            frames = frames_of(bytes(message))
-            made = await run_in_threadpool(exported, kind, frames)
+            frames = decode_frames(bytes(message))
+            made = await run_in_threadpool(export_frames, kind, frames)
         except UsSimError as error:
             return Response(str(error), 400, media_type="text/plain")
         return Response(made, media_type="application/octet-stream")
@@ -442,14 +446,14 @@ async def serve_page(websocket: WebSocket, simulator: Simulator) -> None:
     sending = asyncio.ensure_future(_send(websocket, page, awake))
     try:
         while True:
-            wrong = page.take(await websocket.receive_text())
+            wrong = page.obey_message(await websocket.receive_text())
             if wrong:
                 await websocket.send_text(json.dumps({"problem": wrong}))
     except (WebSocketDisconnect, RuntimeError, KeyError):
         pass  # it has gone, or sends bytes, which no page does
     finally:
         sending.cancel()
-        page.watch([])
+        page.watch_kinds([])
         for command in simulator.leaving:
             command(page.number)
 
@@ -461,7 +465,7 @@ async def _send(websocket: WebSocket, page: PageStream, awake: asyncio.Event) ->
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(awake.wait(), later)
         awake.clear()
-        packets, later = page.due(loop.time())
+        packets, later = page.collect_due(loop.time())
         try:
             for packet in packets:
                 await websocket.send_bytes(packet)

@@ -1,10 +1,10 @@
 """A parameter of a node as a page shows it: in the unit a person reads, with range and meaning.
 
->>> from us_sim.viewer.parameters import Kind, Parameter
+>>> from us_sim.viewer.parameters import ParameterKind, Parameter
 >>> depth = Parameter(
-...     "slice_interpolator", "depth", Kind.NUMBER, 0.04, unit="mm", size=1e-3, limits=(0.005, 0.4)
+...     "slice_interpolator", "depth", ParameterKind.NUMBER, 0.04, unit="mm", size=1e-3, limits=(0.005, 0.4)
 ... )
->>> depth.value, depth.low, depth.high, depth.raw_of(45)
+>>> depth.value, depth.low, depth.high, depth.convert_to_raw(45)
 (40.0, 5.0, 400.0, 0.045)
 """
 
@@ -20,7 +20,7 @@ from typing import Any
 from rclpy.parameter import Parameter as RosParameter
 
 from us_sim.errors import SettingsError
-from us_sim.settings.spelling import shown
+from us_sim.settings.spelling import short_repr
 
 _DIGITS = 12  # of a number that is shown: fewer than a float has, so that rounding is not seen
 _AT_THE_END = 1e-11  # how far from the end of its range, relatively, a number may be by rounding
@@ -28,7 +28,7 @@ _NAMES = {"m mode": "M-mode", "nyquist": "Nyquist"}  # that are written otherwis
 _WHOLE = 2**63  # whole numbers from here on do not fit into a parameter
 
 
-class Kind(Enum):
+class ParameterKind(Enum):
     """The types of parameters that have a control; it is known by the name of the kind."""
 
     TRUTH = RosParameter.Type.BOOL
@@ -41,13 +41,13 @@ class Kind(Enum):
     OTHER = RosParameter.Type.NOT_SET
 
     @classmethod
-    def _missing_(cls, _: object) -> Kind:
+    def _missing_(cls, _: object) -> ParameterKind:
         return cls.OTHER
 
     @property
     def is_list(self) -> bool:
         """Whether its value is a tuple."""
-        return self in (Kind.WHOLES, Kind.NUMBERS, Kind.TEXTS)
+        return self in (ParameterKind.WHOLES, ParameterKind.NUMBERS, ParameterKind.TEXTS)
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Parameter:
 
     node: str  # name within the namespace
     name: str
-    kind: Kind
+    kind: ParameterKind
     raw: Any  # in SI units; lists are tuples
     unit: str = ""  # that a person reads
     size: float = 1.0  # SI units in one of ``unit``
@@ -73,9 +73,9 @@ class Parameter:
         is_nothing = not any(self.raw) if isinstance(self.raw, tuple) else self.raw in (0, "")
         if self.may_be_nothing and is_nothing:
             return None
-        if self.kind is Kind.NUMBERS:
+        if self.kind is ParameterKind.NUMBERS:
             return tuple(map(self._shown, self.raw))
-        return self._shown(self.raw) if self.kind is Kind.NUMBER else self.raw
+        return self._shown(self.raw) if self.kind is ParameterKind.NUMBER else self.raw
 
     @property
     def low(self) -> float | None:
@@ -95,26 +95,28 @@ class Parameter:
     @property
     def label(self) -> str:
         """The last part of its name in words."""
-        return in_words(self.name.rpartition(".")[2])
+        return format_name(self.name.rpartition(".")[2])
 
-    def raw_of(self, value: Any) -> Any:
+    def convert_to_raw(self, value: Any) -> Any:
         """Convert a value that a person has set, in ``unit``, to SI units.
 
         Raises:
             SettingsError: it is no value of this kind, or outside the range.
         """
-        if value is None or (value == "" and self.kind is not Kind.TEXT):
+        if value is None or (value == "" and self.kind is not ParameterKind.TEXT):
             if not self.may_be_nothing:
                 raise SettingsError(f"{self.label} needs a value")
-            is_numbers = self.kind is Kind.NUMBERS
+            is_numbers = self.kind is ParameterKind.NUMBERS
             return (0.0,) * max(1, len(self.raw)) if is_numbers else type(self.raw)()
-        if self.kind in (Kind.WHOLE, Kind.NUMBER):
+        if self.kind in (ParameterKind.WHOLE, ParameterKind.NUMBER):
             return self._in_range(self._number(value))
         if self.kind.is_list and isinstance(value, list | tuple):
-            return tuple(map(str if self.kind is Kind.TEXTS else self._number, value))
-        if isinstance(value, {Kind.TRUTH: bool, Kind.TEXT: str}.get(self.kind, ())):
+            return tuple(map(str if self.kind is ParameterKind.TEXTS else self._number, value))
+        if isinstance(
+            value, {ParameterKind.TRUTH: bool, ParameterKind.TEXT: str}.get(self.kind, ())
+        ):
             return value
-        raise SettingsError(f"{self.label}: {shown(value)} is not what it can be set to")
+        raise SettingsError(f"{self.label}: {short_repr(value)} is not what it can be set to")
 
     def with_raw(self, raw: Any) -> Parameter:
         """Return the parameter after it was set."""
@@ -130,8 +132,8 @@ class Parameter:
         except (TypeError, ValueError, OverflowError):
             number = math.nan
         if isinstance(value, bool) or not math.isfinite(number):
-            raise SettingsError(f"{self.label}: {shown(value)} is not a number")
-        if self.kind in (Kind.WHOLE, Kind.WHOLES):
+            raise SettingsError(f"{self.label}: {short_repr(value)} is not a number")
+        if self.kind in (ParameterKind.WHOLE, ParameterKind.WHOLES):
             if number != int(number) or abs(number) >= _WHOLE:
                 raise SettingsError(f"{self.label}: {number:g} is not a whole number below 2^63")
             return int(number)
@@ -152,10 +154,10 @@ class Parameter:
         return raw
 
 
-def in_words(name: str) -> str:
+def format_name(name: str) -> str:
     """Write the name of a parameter or a group as a person reads it.
 
-    >>> in_words("colour.nyquist_velocity"), in_words("m_mode")
+    >>> format_name("colour.nyquist_velocity"), format_name("m_mode")
     ('colour · Nyquist velocity', 'M-mode')
     """
     words = name.replace("_", " ").replace(".", " · ")

@@ -21,7 +21,7 @@ from rclpy.parameter_client import AsyncParameterClient
 
 from us_sim.errors import SettingsError
 from us_sim.settings.quantity import units_of
-from us_sim.viewer.parameters import Kind, Parameter
+from us_sim.viewer.parameters import Parameter, ParameterKind
 
 ANSWER_S = 10.0  # how long an answer is waited for: a node that makes images anew may need seconds
 LOOK_S = 0.5  # how often it is looked whether a node has come, gone, or been started again
@@ -34,18 +34,18 @@ SILENT = "does not answer what its parameters are"
 THERE = ""
 
 
-def answered(sentence: str) -> Future[str]:
+def make_answer(sentence: str) -> Future[str]:
     """Return a future that holds the sentence already."""
     told: Future[str] = Future()
     told.set_result(sentence)
     return told
 
 
-def set_together(client: AsyncParameterClient, parameters: Sequence[RosParameter]) -> Future[str]:
+def set_atomically(client: AsyncParameterClient, parameters: Sequence[RosParameter]) -> Future[str]:
     """Set all of these parameters, or none; the future holds why not, or nothing."""
     name = client.remote_node_name.rpartition("/")[2]
     if not client.services_are_ready():
-        return answered(f"{name} offers no parameters at present")
+        return make_answer(f"{name} offers no parameters at present")
     told: Future[str] = Future()
 
     def on_answer(answer: Any) -> None:
@@ -57,7 +57,7 @@ def set_together(client: AsyncParameterClient, parameters: Sequence[RosParameter
     return told
 
 
-async def in_time(told: Future[str], name: str) -> str:
+async def await_answer(told: Future[str], name: str) -> str:
     """Await what a node says, or say that it says nothing."""
     try:
         return await asyncio.wait_for(asyncio.wrap_future(told), ANSWER_S)
@@ -93,19 +93,19 @@ class NodeParameters:
         self._following: asyncio.Task[None] | None = None
         self._is_old = asyncio.Event()  # what is known
 
-    def watch(self) -> None:
-        """Follow the parameters, until `unwatch`."""
+    def add_page(self) -> None:
+        """Follow the parameters, until `remove_page`."""
         self.pages += 1
         if self.pages == 1 and self._client is not None:
             self._following = asyncio.ensure_future(self._follow(self._client))
 
-    def unwatch(self) -> None:
+    def remove_page(self) -> None:
         """Follow them no longer."""
         self.pages -= 1
         if not self.pages and self._following is not None:
             self._following.cancel()
 
-    async def set(self, name: str, value: Any) -> str:
+    async def set_value(self, name: str, value: Any) -> str:
         """Set a parameter to a value in the unit that is shown; None is nothing.
 
         Returns:
@@ -115,17 +115,17 @@ class NodeParameters:
         if parameter is None:
             return f"{self.name} has no parameter {name} at present"
         try:
-            return await self._send(parameter, parameter.raw_of(value))
+            return await self._send(parameter, parameter.convert_to_raw(value))
         except SettingsError as error:
             return str(error)
 
     async def _send(self, parameter: Parameter, raw: Any) -> str:
         name = parameter.name
         if self._door is not None:
-            return await in_time(self._door(**{name: raw}), self.name)
+            return await await_answer(self._door(**{name: raw}), self.name)
         assert self._client is not None  # which has told of the parameter
-        told = set_together(self._client, [RosParameter(name, parameter.kind.value, raw)])
-        refused = await in_time(told, self.name)
+        told = set_atomically(self._client, [RosParameter(name, parameter.kind.value, raw)])
+        refused = await await_answer(told, self.name)
         if not refused and self.parameters.get(name) is parameter:  # nothing newer has come
             self.parameters = {**self.parameters, name: parameter.with_raw(raw)}
         return refused
@@ -211,7 +211,7 @@ class RemoteParameters:
         self._node, self._doors = node, doors or {}
         self._nodes: dict[str, NodeParameters] = {}
 
-    def of(self, name: str) -> NodeParameters:
+    def get_node(self, name: str) -> NodeParameters:
         """Return those of a node, always the same object; any thread may ask."""
         made = self._nodes.get(name)
         return made or self._nodes.setdefault(name, self._make(name))
@@ -269,13 +269,13 @@ def _parameter(
         meanings={choice: text for choice, text in meanings.items() if text},
         may_be_nothing="none" in told,
         description=descriptor.description,
-        is_live=not descriptor.read_only and kind is not Kind.OTHER,
+        is_live=not descriptor.read_only and kind is not ParameterKind.OTHER,
     )
 
 
-def _value(value: ParameterValue) -> tuple[Kind, Any]:
+def _value(value: ParameterValue) -> tuple[ParameterKind, Any]:
     """Return a value's kind and its value; lists are tuples."""
-    kind, raw = Kind(RosParameter.Type(value.type)), parameter_value_to_python(value)
-    if kind is Kind.OTHER:
+    kind, raw = ParameterKind(RosParameter.Type(value.type)), parameter_value_to_python(value)
+    if kind is ParameterKind.OTHER:
         return kind, None
     return kind, tuple(raw) if kind.is_list else raw

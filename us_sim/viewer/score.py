@@ -12,13 +12,13 @@ from sensor_msgs.msg import CompressedImage
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from us_sim.nodes.guarded_node import GuardedNode, shown
-from us_sim.nodes.qos import LATCHED, STREAM, overridable
+from us_sim.nodes.guarded_node import GuardedNode, loggable_text
+from us_sim.nodes.qos import LATCHED, STREAM, qos_override_options
 from us_sim.nodes.topics import FROZEN
 from us_sim.recording import MARKER
 from us_sim.scoring.settings import STATES
-from us_sim.viewer.feeds import topic_feed
-from us_sim.viewer.stream import Packet, Posted, Simulator
+from us_sim.viewer.feeds import make_topic_feed
+from us_sim.viewer.stream import CallPoster, Packet, Simulator
 
 SCORE, PICTURE = "score", "score_picture"
 """Streams: of an exercise's steps and the metrics, and of their picture as PNG."""
@@ -26,7 +26,7 @@ _STATES = {DiagnosticStatus.OK: "done", DiagnosticStatus.ERROR: "missed"}
 _SHAPES = {"target": (-1, 3), "pose": (7,)}  # of the numbers that a step may have
 
 
-def add_score(node: GuardedNode, post: Posted, simulator: Simulator) -> None:
+def connect_scorer(node: GuardedNode, post: CallPoster, simulator: Simulator) -> None:
     """Give pages the score, have them ask `scorer`, and mark when they freeze an image.
 
     Args:
@@ -34,7 +34,9 @@ def add_score(node: GuardedNode, post: Posted, simulator: Simulator) -> None:
         post: has work done in the thread that spins ``node``.
         simulator: what pages see.
     """
-    marks = node.create_publisher(String, MARKER, STREAM, qos_overriding_options=overridable())
+    marks = node.create_publisher(
+        String, MARKER, STREAM, qos_overriding_options=qos_override_options()
+    )
     services = {name: node.create_client(Trigger, f"scorer/{name}") for name in ("clear", "draw")}
 
     def ask(what: str) -> None:
@@ -48,25 +50,31 @@ def add_score(node: GuardedNode, post: Posted, simulator: Simulator) -> None:
 
     simulator.commands["frozen"] = mark
     simulator.ask_scorer = lambda what: post(lambda: ask(what))
-    simulator.add(
-        topic_feed(node, post, DiagnosticArray, "score", score_packet, SCORE, None, LATCHED),
-        topic_feed(node, post, CompressedImage, "score/picture", _picture, PICTURE, None, LATCHED),
+    simulator.add_feeds(
+        make_topic_feed(
+            node, post, DiagnosticArray, "score", make_score_packet, SCORE, None, LATCHED
+        ),
+        make_topic_feed(
+            node, post, CompressedImage, "score/picture", _picture, PICTURE, None, LATCHED
+        ),
     )
 
 
-def score_packet(message: DiagnosticArray, sequence: int) -> Packet:
+def make_score_packet(message: DiagnosticArray, sequence: int) -> Packet:
     """Return a packet of the document of `us_sim.scoring.result`, without a payload."""
     first, *others = message.status or [DiagnosticStatus()]
     of_kind: dict[str, list[DiagnosticStatus]] = {}
     for status in others:
-        of_kind.setdefault(shown(status.hardware_id), []).append(status)
+        of_kind.setdefault(loggable_text(status.hardware_id), []).append(status)
     plain, about = (of_kind.get(kind, [DiagnosticStatus()])[0] for kind in ("plain", "about"))
-    faults = [{"what": shown(each.message), **_values(each)} for each in of_kind.get("fault", [])]
+    faults = [
+        {"what": loggable_text(each.message), **_values(each)} for each in of_kind.get("fault", [])
+    ]
     state = plain.message if plain.message in STATES else "to lift"
     header = {
-        "name": shown(first.name),
-        "description": shown(first.message),
-        "scene": shown(first.hardware_id),
+        "name": loggable_text(first.name),
+        "description": loggable_text(first.message),
+        "scene": loggable_text(first.hardware_id),
         "state": state,
         "words": STATES[state],
         "about": {"begun": "", "feedback": "live", **_values(about)},
@@ -78,10 +86,10 @@ def score_packet(message: DiagnosticArray, sequence: int) -> Packet:
     return Packet(SCORE, sequence, header, b"")
 
 
-def told_score(simulator: Simulator) -> Mapping[str, Any]:
+def get_score(simulator: Simulator) -> Mapping[str, Any]:
     """Return the newest score of the scene that runs; empty where there is none."""
     feed, state = simulator.feeds.get(SCORE), simulator.session.state
-    packet = feed.newest() if feed is not None else None
+    packet = feed.get_newest() if feed is not None else None
     is_other = packet is not None and state.is_there and packet.header["scene"] != state.scene
     return {} if packet is None or is_other else packet.header
 
@@ -93,11 +101,11 @@ def is_blind(told: Mapping[str, Any]) -> bool:
 
 
 def _values(status: DiagnosticStatus) -> dict[str, str]:
-    return {shown(each.key): shown(each.value) for each in status.values}
+    return {loggable_text(each.key): loggable_text(each.value) for each in status.values}
 
 
 def _step(status: DiagnosticStatus) -> dict[str, Any]:
-    step = {"what": shown(status.name), "seen": shown(status.message)}
+    step = {"what": loggable_text(status.name), "seen": loggable_text(status.message)}
     step["state"] = _STATES.get(status.level, "to do")
     places = {e.key: _numbers(e.value, _SHAPES[e.key]) for e in status.values if e.key in _SHAPES}
     return step | {key: numbers for key, numbers in places.items() if numbers}

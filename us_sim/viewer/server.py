@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING, Any
 
 from us_sim.cache import cache_folder
 from us_sim.errors import UsSimError
-from us_sim.viewer.access import Access, is_loopback
+from us_sim.viewer.access import AccessControl, is_loopback
 
 if TYPE_CHECKING:  # since `us_sim.run.plan` asks for a free port where there is no rclpy
     from us_sim.viewer.stream import Simulator
 
 
-def require_free(host: str, port: int) -> None:
+def require_free_address(host: str, port: int) -> None:
     """Raise UsSimError when nobody can listen there now."""
-    listening(host, port).close()
+    open_socket(host, port).close()
 
 
-def listening(host: str, port: int) -> socket.socket:
+def open_socket(host: str, port: int) -> socket.socket:
     """A socket that listens there.
 
     Raises:
@@ -78,10 +78,10 @@ class WebServer:
     ) -> None:
         self.token = "" if is_loopback(host) else _checked(token) or secrets.token_urlsafe(16)
         self._uvicorn, application = _made(simulator)
-        self._socket = listening(host, port)
+        self._socket = open_socket(host, port)
         self.host, self.port = host, int(self._socket.getsockname()[1])
         config = self._uvicorn.Config(
-            Access(application, self.token),
+            AccessControl(application, self.token),
             log_level="warning",
             ws_per_message_deflate=False,  # it costs more time than this computer's wire
             ws_max_size=2**20,
@@ -145,12 +145,12 @@ def _made(simulator: Simulator) -> tuple[Any, Any]:
     try:
         import uvicorn
 
-        from us_sim.viewer.page import application
+        from us_sim.viewer.page import make_application
     except ImportError as error:
         raise UsSimError(
             f"the viewer needs {error.name}: install it with `pip install 'us_sim[viewer]'`"
         ) from error
-    return uvicorn, application(simulator)
+    return uvicorn, make_application(simulator)
 
 
 def _checked(token: str) -> str:

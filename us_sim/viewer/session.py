@@ -2,7 +2,7 @@
 
 >>> from us_sim.viewer.session import SessionBoard
 >>> board = SessionBoard()
->>> board.state.is_there, board.ask(record="a.mcap").result()
+>>> board.state.is_there, board.ask_control(record="a.mcap").result()
 (False, 'us-sim does not run this simulation, so nothing can be loaded or recorded from here')
 """
 
@@ -21,11 +21,11 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 
-from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, shown
+from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, loggable_text
 from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.scene.listing import ListedScene
-from us_sim.viewer.remote_parameters import answered, set_together
-from us_sim.viewer.status import Watched
+from us_sim.viewer.remote_parameters import make_answer, set_atomically
+from us_sim.viewer.status import PageCounter
 
 NOT_THERE = "us-sim does not run this simulation, so nothing can be loaded or recorded from here"
 
@@ -77,7 +77,7 @@ class SessionState:
         return is_awaited or self.replay_state == "playing"
 
     @classmethod
-    def of(cls, status: DiagnosticStatus) -> SessionState:
+    def from_status(cls, status: DiagnosticStatus) -> SessionState:
         """Read the report of `session_control`."""
         said = {each.key: each.value for each in status.values}
         values: dict[str, Any] = {"is_there": True, "state": said.get("state", status.message)}
@@ -96,7 +96,7 @@ class SessionState:
         return cls(**values)
 
 
-class SessionBoard(Watched):
+class SessionBoard(PageCounter):
     """The newest that is known of the session, and who shows it; for any thread.
 
     Args:
@@ -122,7 +122,7 @@ class SessionBoard(Watched):
         self.scenes: tuple[ListedScene, ...] = ()  # another object whenever it changes
         self.bags: Mapping[str, str] = {}  # files that can be played, by name
 
-    def ask(self, **values: object) -> Future[str]:
+    def ask_control(self, **values: object) -> Future[str]:
         """Set parameters of ``session_control``; the future holds why not, or nothing."""
         refusal = "" if self._is_own else self._refusal(values)
         if self._send_to_control is not None and self.state.is_there and not refusal:
@@ -130,7 +130,7 @@ class SessionBoard(Watched):
             if self.folder and file:
                 values["record"] = str(PurePath(self.folder, str(file)))
             return self._send_to_control(values)
-        return answered(refusal or NOT_THERE)
+        return make_answer(refusal or NOT_THERE)
 
     def _refusal(self, values: Mapping[str, object]) -> str:
         """Why pages of other computers may not ask for this; "" where they may."""
@@ -190,14 +190,14 @@ class ViewerSession(SessionBoard):
     def _listen(self) -> None:
         if self.is_watched and self._client is None:
             self._client = AsyncParameterClient(self._node, CONTROL)
-        if self._subscriptions.keep(self.is_watched):
+        if self._subscriptions.set_active(self.is_watched):
             (self._timer.reset if self.is_watched else self._timer.cancel)()
 
     def _hear(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name == self._name:
                 self._heard = time.monotonic()
-                before, self.state = self.state, SessionState.of(status)
+                before, self.state = self.state, SessionState.from_status(status)
                 if before.is_there and before.origin != self.state.origin:
                     self.on_other_scene()
 
@@ -205,7 +205,7 @@ class ViewerSession(SessionBoard):
         self.scenes = tuple(map(_scene_of, message.status))
 
     def _take_bags(self, message: DiagnosticArray) -> None:
-        self.bags = {shown(status.name): status.hardware_id for status in message.status}
+        self.bags = {loggable_text(status.name): status.hardware_id for status in message.status}
 
     def _check(self) -> None:
         """Notice when nobody answers for the simulation any more."""
@@ -214,16 +214,16 @@ class ViewerSession(SessionBoard):
 
     def _send(self, values: Mapping[str, object]) -> Future[str]:
         if self._client is None:
-            return answered(NOT_THERE)
-        return set_together(self._client, [Parameter(n, value=v) for n, v in values.items()])
+            return make_answer(NOT_THERE)
+        return set_atomically(self._client, [Parameter(n, value=v) for n, v in values.items()])
 
 
 def _scene_of(status: DiagnosticStatus) -> ListedScene:
-    about = {each.key: shown(each.value) for each in status.values}
+    about = {each.key: loggable_text(each.value) for each in status.values}
     is_wrong = status.level != DiagnosticStatus.OK
-    said = shown(status.message)
+    said = loggable_text(status.message)
     return ListedScene(
-        shown(status.name),
+        loggable_text(status.name),
         status.hardware_id,
         about.get("kind", "scene"),
         "" if is_wrong else said,

@@ -1,9 +1,9 @@
 """The state that every node last reported, and how some of its numbers went over a minute.
 
->>> from us_sim.viewer.status import Level, NodeStatus, StatusBoard
+>>> from us_sim.viewer.status import NodeLevel, NodeStatus, StatusBoard
 >>> board = StatusBoard()
->>> board.tell(NodeStatus("tissue_deformer", Level.WELL, "fem", {"rate_hz": "59.9"}), now=10.0)
->>> board.nodes(now=11.0)[0].number("rate_hz"), board.nodes(now=15.0)[0].level
+>>> board.add_report(NodeStatus("tissue_deformer", NodeLevel.WELL, "fem", {"rate_hz": "59.9"}), now=10.0)
+>>> board.list_nodes(now=11.0)[0].read_number("rate_hz"), board.list_nodes(now=15.0)[0].level
 (59.9, <Level.GONE: 'gone'>)
 """
 
@@ -21,7 +21,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 
-from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, shown
+from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, loggable_text
 from us_sim.nodes.qos import STREAM
 
 GONE_S = 3.0  # without a report, after which a node counts as gone: each reports every second
@@ -34,7 +34,7 @@ PLOTTED = ("rate_hz", "latency_p50_ms", "latency_p99_ms", "residual", "differenc
 Point = tuple[float, float]  # s of the monotonic clock, and the value then
 
 
-class Level(Enum):
+class NodeLevel(Enum):
     """Health of a node."""
 
     WELL = "well"
@@ -43,8 +43,8 @@ class Level(Enum):
     GONE = "gone"
 
 
-_LEVELS = {DiagnosticStatus.OK: Level.WELL, DiagnosticStatus.WARN: Level.WARNING}
-_LEVELS |= {DiagnosticStatus.ERROR: Level.ERROR, DiagnosticStatus.STALE: Level.WARNING}
+_LEVELS = {DiagnosticStatus.OK: NodeLevel.WELL, DiagnosticStatus.WARN: NodeLevel.WARNING}
+_LEVELS |= {DiagnosticStatus.ERROR: NodeLevel.ERROR, DiagnosticStatus.STALE: NodeLevel.WARNING}
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class NodeStatus:
     """A node's report of itself."""
 
     name: str
-    level: Level
+    level: NodeLevel
     message: str  # its state, or its problem
     values: Mapping[str, str] = field(default_factory=dict)  # as in its diagnostics
     heard: float = 0.0  # s, monotonic
@@ -68,10 +68,12 @@ class NodeStatus:
     @property
     def problems(self) -> int:
         """Messages that it could not use, and exceptions."""
-        counts = (self.number(key) for key in self.values if key.startswith(("rejected", "failed")))
+        counts = (
+            self.read_number(key) for key in self.values if key.startswith(("rejected", "failed"))
+        )
         return sum(int(count or 0) for count in counts)
 
-    def number(self, key: str) -> float | None:
+    def read_number(self, key: str) -> float | None:
         """A finite number in its report, if there is one."""
         try:
             number = float(self.values[key])
@@ -80,7 +82,7 @@ class NodeStatus:
         return number if math.isfinite(number) else None
 
 
-class Watched:
+class PageCounter:
     """Counts the pages that show something; for any thread.
 
     Args:
@@ -97,11 +99,11 @@ class Watched:
         """Whether a page shows it."""
         return self._pages > 0
 
-    def watch(self) -> None:
+    def add_page(self) -> None:
         """One page more shows it."""
         self._count(1)
 
-    def unwatch(self) -> None:
+    def remove_page(self) -> None:
         """One page shows it no longer."""
         self._count(-1)
 
@@ -114,7 +116,7 @@ class Watched:
             self._on_watch()
 
 
-class StatusBoard(Watched):
+class StatusBoard(PageCounter):
     """The newest report of each node, and the histories that are plotted; for any thread.
 
     Args:
@@ -123,23 +125,23 @@ class StatusBoard(Watched):
 
     def __init__(self, on_watch: Callable[[], None] = lambda: None) -> None:
         super().__init__(on_watch)
-        self.force = Watched(on_watch)  # the pages that plot it
+        self.force = PageCounter(on_watch)  # the pages that plot it
         self._nodes: dict[str, NodeStatus] = {}
         self._histories: dict[tuple[str, str], deque[Point]] = {}
         self._forces: deque[Point] = deque(maxlen=int(HISTORY_S * FORCES_A_SECOND))
         self._since = 0.0  # s, monotonic, since when pages show it; nothing is heard before
 
-    def watch(self) -> None:
+    def add_page(self) -> None:
         """One page more shows it; nodes do not count as gone for the time in which none did."""
         if not self.is_watched:
             self._since = time.monotonic()
-        super().watch()
+        super().add_page()
 
-    def tell(self, status: NodeStatus, now: float) -> None:
+    def add_report(self, status: NodeStatus, now: float) -> None:
         """Keep a report, at a time of the monotonic clock in s."""
         with self._lock:
             before = self._nodes.get(status.name)
-            if status.level is not Level.WELL:
+            if status.level is not NodeLevel.WELL:
                 problem, kind, heard = status.message, status.values.get("problem", ""), now
             elif before:
                 problem, kind, heard = before.problem, before.problem_kind, before.problem_heard
@@ -149,12 +151,12 @@ class StatusBoard(Watched):
                 status, heard=now, problem=problem, problem_kind=kind, problem_heard=heard
             )
             for key in PLOTTED:
-                number = status.number(key)
+                number = status.read_number(key)
                 if number is not None:
                     history = self._histories.setdefault((status.name, key), deque(maxlen=100))
                     history.append((now, number))
 
-    def feel(self, force: float, now: float) -> None:
+    def add_force(self, force: float, now: float) -> None:
         """Keep the force on the probe in N, at a time of the monotonic clock in s."""
         with self._lock:
             if self._forces and now - self._forces[-1][0] < 1.0 / FORCES_A_SECOND:
@@ -163,23 +165,23 @@ class StatusBoard(Watched):
             else:
                 self._forces.append((now, force))
 
-    def nodes(self, now: float) -> list[NodeStatus]:
+    def list_nodes(self, now: float) -> list[NodeStatus]:
         """The nodes by name, without those that have long been gone."""
         with self._lock:
             known = sorted(self._nodes.values(), key=lambda status: status.name)
         return [
-            replace(status, level=Level.GONE, message="silent", values={})
+            replace(status, level=NodeLevel.GONE, message="silent", values={})
             if now - max(status.heard, self._since) > GONE_S
             else status
             for status in known
             if now - status.heard < FORGOTTEN_S
         ]
 
-    def node(self, name: str, now: float) -> NodeStatus | None:
+    def find_node(self, name: str, now: float) -> NodeStatus | None:
         """One node, if it ever reported."""
-        return next((each for each in self.nodes(now) if each.name == name), None)
+        return next((each for each in self.list_nodes(now) if each.name == name), None)
 
-    def history(self, key: str, since: float) -> dict[str, list[Point]]:
+    def get_history(self, key: str, since: float) -> dict[str, list[Point]]:
         """The values of one key after a time, by nodes."""
         with self._lock:
             return {
@@ -188,7 +190,7 @@ class StatusBoard(Watched):
                 if told == key and points[-1][0] > since
             }
 
-    def forces(self, since: float) -> list[Point]:
+    def get_forces(self, since: float) -> list[Point]:
         """The force on the probe after a time, N."""
         with self._lock:
             return [point for point in self._forces if point[0] > since]
@@ -213,17 +215,17 @@ class StatusListener(StatusBoard):
         )
 
     def _subscribe(self) -> None:
-        self._reports.keep(self.is_watched)
-        self._wrenches.keep(self.force.is_watched)
+        self._reports.set_active(self.is_watched)
+        self._wrenches.set_active(self.force.is_watched)
 
     def _hear(self, message: DiagnosticArray) -> None:
         now = time.monotonic()
         for status in message.status:
-            level = _LEVELS.get(status.level, Level.ERROR)
-            values = {each.key: shown(each.value) for each in status.values}
-            name = shown(status.name).removeprefix(self._space)
-            self.tell(NodeStatus(name, level, shown(status.message), values), now)
+            level = _LEVELS.get(status.level, NodeLevel.ERROR)
+            values = {each.key: loggable_text(each.value) for each in status.values}
+            name = loggable_text(status.name).removeprefix(self._space)
+            self.add_report(NodeStatus(name, level, loggable_text(status.message), values), now)
 
     def _hear_force(self, message: WrenchStamped) -> None:
         force = message.wrench.force
-        self.feel((force.x**2 + force.y**2 + force.z**2) ** 0.5, time.monotonic())
+        self.add_force((force.x**2 + force.y**2 + force.z**2) ** 0.5, time.monotonic())

@@ -2,15 +2,15 @@
 
 >>> from us_sim.viewer.stream import Feed, Packet
 >>> packet = Packet("image", 7, {"rows": 1, "columns": 4}, bytes([0, 85, 170, 255]))
->>> len(packet.encoded) % 4, Packet.decoded(packet.encoded) == packet
+>>> len(packet.encoded) % 4, Packet.from_bytes(packet.encoded) == packet
 (0, True)
 >>> feed = Feed("image", lambda watched: print("watched" if watched else "left"))
 >>> told = []
 >>> feed.watch(lambda: told.append(feed.sequence))
 watched
->>> feed.offer(lambda sequence: Packet("image", sequence, {}, b"first"))
->>> feed.offer(lambda sequence: Packet("image", sequence, {}, b"second"))
->>> told, feed.newest().payload
+>>> feed.offer_packet(lambda sequence: Packet("image", sequence, {}, b"first"))
+>>> feed.offer_packet(lambda sequence: Packet("image", sequence, {}, b"second"))
+>>> told, feed.get_newest().payload
 ([1, 2], b'second')
 """
 
@@ -57,7 +57,7 @@ class Packet:
         return b"".join((_LENGTH.pack(len(text)), text, self.payload))
 
     @classmethod
-    def decoded(cls, data: bytes) -> Packet:
+    def from_bytes(cls, data: bytes) -> Packet:
         """The packet of :attr:`encoded`."""
         (length,) = _LENGTH.unpack_from(data)
         header = json.loads(data[_LENGTH.size : _LENGTH.size + length])
@@ -99,7 +99,7 @@ class Feed:
         """Whether any page watches."""
         return bool(self._watchers)
 
-    def watch(self, notify: Callable[[], None]) -> None:
+    def add_watcher(self, notify: Callable[[], None]) -> None:
         """Have ``notify`` called, from any thread, whenever there is a newer packet."""
         with self._lock:
             self._watchers.append(notify)
@@ -107,7 +107,7 @@ class Feed:
         if first:
             self._on_watch(True)
 
-    def unwatch(self, notify: Callable[[], None]) -> None:
+    def remove_watcher(self, notify: Callable[[], None]) -> None:
         """Stop the calls of ``notify``."""
         with self._lock:
             self._watchers.remove(notify)
@@ -115,7 +115,7 @@ class Feed:
         if last:
             self._on_watch(False)
 
-    def offer(self, pack: Pack) -> None:
+    def offer_packet(self, pack: Pack) -> None:
         """Announce a newer packet, which ``pack`` makes if any page takes it."""
         with self._lock:
             self.sequence += 1
@@ -124,12 +124,12 @@ class Feed:
         for notify in watchers:
             notify()
 
-    def forget(self) -> None:
+    def forget_packet(self) -> None:
         """Drop the newest packet, as when another scene is loaded."""
         with self._lock:
             self._pack = None
 
-    def newest(self) -> Packet | None:
+    def get_newest(self) -> Packet | None:
         """The newest packet, made once for all pages; None where there is none to be used."""
         with self._packing:
             with self._lock:
@@ -162,11 +162,11 @@ class Simulator:
         def watched(kind: str) -> bool:
             return kind in self.feeds and self.feeds[kind].is_watched
 
-        overlay = self.nodes.of("slice_interpolator").parameters.get("overlay")
+        overlay = self.nodes.get_node("slice_interpolator").parameters.get("overlay")
         colours = overlay is not None and overlay.raw == "velocity" and watched("annotated")
         return colours or any(map(watched, STRIPS))
 
-    def add(self, *feeds: Feed) -> None:
+    def add_feeds(self, *feeds: Feed) -> None:
         """Let pages watch these."""
         self.feeds |= {feed.kind: feed for feed in feeds}
 
@@ -194,7 +194,7 @@ class PageStream:
         self._sent: dict[str, int] = {}
         self._earliest: dict[str, float] = {}  # s, when the next may be sent
 
-    def take(self, text: str) -> str | None:
+    def obey_message(self, text: str) -> str | None:
         """Obey a page's message; an error for a person, or None."""
         try:
             message = json.loads(text) if len(text) <= _LONGEST else None
@@ -210,7 +210,7 @@ class PageStream:
 
     def _take(self, key: str, value: Any) -> str | None:
         if key == "watch" and isinstance(value, list):
-            self.watch([kind for kind in value if isinstance(kind, str)])
+            self.watch_kinds([kind for kind in value if isinstance(kind, str)])
         elif key == "next" and isinstance(value, str):
             self._ready.add(value)
             self._wake()
@@ -221,20 +221,20 @@ class PageStream:
             return f"the page sent {key!r}, which the viewer does not know: load the page again"
         return None
 
-    def watch(self, kinds: list[str]) -> None:
+    def watch_kinds(self, kinds: list[str]) -> None:
         """Watch these, and no others; kinds that are not known may come later."""
         for kind in self._watched.keys() - set(kinds):
-            self._watched.pop(kind).unwatch(self._wake)
+            self._watched.pop(kind).remove_watcher(self._wake)
         for kind in kinds:
             feed = self._simulator.feeds.get(kind)
             if feed is not None and kind not in self._watched:
                 self._watched[kind] = feed
                 self._ready.add(kind)
                 self._sent[kind] = 0
-                feed.watch(self._wake)
+                feed.add_watcher(self._wake)
         self._wake()
 
-    def due(self, now: float) -> tuple[list[bytes], float | None]:
+    def collect_due(self, now: float) -> tuple[list[bytes], float | None]:
         """The encoded packets to be sent now, and s until one that waits may be; None without.
 
         Args:
@@ -248,7 +248,7 @@ class PageStream:
             if wait > 0:
                 later = wait if later is None else min(later, wait)
                 continue
-            packet = feed.newest()
+            packet = feed.get_newest()
             self._sent[kind] = feed.sequence if packet is None else packet.sequence
             if packet is not None:
                 self._ready.discard(kind)
@@ -259,7 +259,7 @@ class PageStream:
         return packets, later
 
 
-class Posted:
+class CallPoster:
     """Runs calls from any thread in the node's thread, in order.
 
     Args:

@@ -1,13 +1,13 @@
 """Surfaces as they go to a page: told once at rest, after which only positions travel.
 
 >>> import numpy as np
->>> from us_sim.viewer.surfaces import RestSurface, welded
+>>> from us_sim.viewer.surfaces import StreamedSurface, weld_corners
 >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 0, 0], [1, 1, 0], [0, 1, 0]])
->>> vertices, triangles = welded(corners)
+>>> vertices, triangles = weld_corners(corners)
 >>> len(vertices), triangles
 (4, array([[0, 1, 3], [0, 3, 2]]))
->>> surface = RestSurface(vertices, triangles)
->>> packet = surface.moved(vertices + [0, 0, 0.001], kind="skin", sequence=1, stamp=0)
+>>> surface = StreamedSurface(vertices, triangles)
+>>> packet = surface.make_packet(vertices + [0, 0, 0.001], kind="skin", sequence=1, stamp=0)
 >>> packet.header["resolution"], len(packet.payload)
 (1e-06, 24)
 """
@@ -41,7 +41,7 @@ class ColouredSurface:
     triangles: NDArray[np.integer]  # (T, 3)
 
 
-def welded(corners: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+def weld_corners(corners: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
     """Vertices (V, 3), each once, and triangles (T, 3), without those that have no area left.
 
     Args:
@@ -55,7 +55,7 @@ def welded(corners: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[
     return ordered[is_new], _with_area(numbers.reshape(-1, 3))
 
 
-def clustered(
+def cluster_vertices(
     vertices: NDArray[np.floating], triangles: NDArray[np.integer], cell: float
 ) -> NDArray[np.integer]:
     """(F, 3) triangles of the same vertices that are left when vertices are merged.
@@ -76,7 +76,7 @@ def clustered(
     return _with_area(used[first][cells.ravel()][corners.ravel()].reshape(-1, 3))
 
 
-def at_most(
+def simplify_surface(
     vertices: NDArray[np.floating], triangles: NDArray[np.integer], count: int
 ) -> NDArray[np.integer]:
     """About ``count`` triangles or fewer of a surface, all where it has no more.
@@ -87,7 +87,7 @@ def at_most(
     sides = vertices[triangles] - vertices[np.roll(triangles, 1, axis=1)]
     cell, fewer = 0.5 * float(np.linalg.norm(sides, axis=2).mean()), triangles
     while len(fewer) > count:
-        fewer = clustered(vertices, triangles, cell)
+        fewer = cluster_vertices(vertices, triangles, cell)
         cell *= 1.15
     return fewer
 
@@ -97,7 +97,7 @@ def _with_area(triangles: NDArray[np.intp]) -> NDArray[np.intp]:
     return triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
 
 
-class RestSurface:
+class StreamedSurface:
     """Points at rest with their triangles and edges, and packets of where they are later.
 
     Args:
@@ -123,13 +123,13 @@ class RestSurface:
         self.number = zlib.crc32(self._payload)
 
     @classmethod
-    def around(cls, mesh: TetrahedralMesh) -> RestSurface:
+    def from_mesh(cls, mesh: TetrahedralMesh) -> StreamedSurface:
         """All nodes of a mesh with its outer faces, and their edges, each once."""
         faces = mesh.boundary
         edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
         return cls(mesh.nodes, faces, np.unique(edges, axis=0))
 
-    def told(self, kind: str, sequence: int) -> Packet:
+    def make_rest_packet(self, kind: str, sequence: int) -> Packet:
         """All of it at rest: points as float32, then triangles and edges as uint32."""
         header = {
             "mesh": self.number,
@@ -139,7 +139,7 @@ class RestSurface:
         }
         return Packet(kind, sequence, header, self._payload)
 
-    def moved(
+    def make_packet(
         self, positions: NDArray[np.floating], *, kind: str, sequence: int, stamp: int
     ) -> Packet:
         """Where the points are now (N, 3) m, as int16 steps from rest; ``stamp`` in ns.
@@ -188,13 +188,14 @@ class CarriedSurfaces:
         surfaces: Sequence[ColouredSurface],
         triangles: int = 20_000,
     ) -> None:
-        from us_sim.tissue.mesh.embedding import locate  # with its kernels
+        from us_sim.tissue.mesh.embedding import locate_points  # with its kernels
 
         whole = sum(len(surface.triangles) for surface in surfaces)
         firsts = np.cumsum([0, *(len(surface.vertices) for surface in surfaces)])
         fine = [s.triangles + first for s, first in zip(surfaces, firsts, strict=False)]
         coarse = [
-            at_most(s.vertices, s.triangles, int(triangles * len(s.triangles) / whole)) + first
+            simplify_surface(s.vertices, s.triangles, int(triangles * len(s.triangles) / whole))
+            + first
             for s, first in zip(surfaces, firsts, strict=False)
         ]
         first_drawn = np.unique(np.concatenate(coarse))
@@ -203,7 +204,7 @@ class CarriedSurfaces:
         number = np.empty(len(order), dtype=np.uint32)
         number[order] = np.arange(len(order), dtype=np.uint32)
         vertices = np.concatenate([surface.vertices for surface in surfaces])[order]
-        location = locate(mesh, vertices)
+        location = locate_points(mesh, vertices)
         if (location.outside > 5e-3).any():
             worst = int(np.argmax(location.outside))
             part = int(np.searchsorted(firsts, order[worst], side="right")) - 1
@@ -219,7 +220,7 @@ class CarriedSurfaces:
         self.coarse = [number[part] for part in coarse]
         self._surfaces = [(surface.name, surface.colour) for surface in surfaces]
 
-    def told(self, kind: str, sequence: int, mesh: int) -> Packet:
+    def make_rest_packet(self, kind: str, sequence: int, mesh: int) -> Packet:
         """Nodes as uint32, weights as float32, then each part's triangles, all and fewer.
 
         Args:
@@ -237,7 +238,7 @@ class CarriedSurfaces:
         return Packet(kind, sequence, header, payload)
 
 
-def transducer_packet(
+def make_transducer_packet(
     kind: str,
     sequence: int,
     parts: Sequence[ColouredSurface],
@@ -247,7 +248,7 @@ def transducer_packet(
 
     Args:
         parts: in frame ``probe``.
-        outline: (P, 3) m, as of `us_sim.slicing.probe.probe.image_outline`.
+        outline: (P, 3) m, as of `us_sim.slicing.probe.probe.compute_image_outline`.
     """
     told, arrays = [], list[NDArray[np.generic]]()
     for part in parts:
@@ -275,7 +276,7 @@ class EquivalentStrain:
             mesh.tetrahedra.ravel(), np.repeat(mesh.volumes, 4), minlength=len(mesh.nodes)
         )
 
-    def of(self, nodes: NDArray[np.floating]) -> NDArray[np.float64]:
+    def compute_strain(self, nodes: NDArray[np.floating]) -> NDArray[np.float64]:
         """(N,) when the mesh's nodes are at (N, 3) m; 0 is without strain."""
         corners = nodes[self._tetrahedra]
         gradient = self._inverse @ (corners[:, 1:] - corners[:, :1])  # the transpose of F

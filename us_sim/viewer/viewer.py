@@ -9,26 +9,26 @@ from typing import Any
 import numpy as np
 
 from us_sim.nodes.guarded_node import GuardedNode, Health
-from us_sim.nodes.parameters import declared
+from us_sim.nodes.parameters import declare_settings
 from us_sim.nodes.process import node_main
 from us_sim.settings.viewer import TOKEN, ViewerSettings
 from us_sim.viewer.access import is_loopback
 from us_sim.viewer.feeds import (
     ProbeFeeds,
-    RestMesh,
+    RestMeshListener,
     SkinFeeds,
     StructuresFeed,
     TissueFeeds,
-    image_feeds,
+    make_image_feeds,
 )
 from us_sim.viewer.hand import ViewerHand
-from us_sim.viewer.parameters import Parameter, in_words
+from us_sim.viewer.parameters import Parameter, format_name
 from us_sim.viewer.remote_parameters import RemoteParameters
-from us_sim.viewer.score import add_score
+from us_sim.viewer.score import connect_scorer
 from us_sim.viewer.server import WebServer
 from us_sim.viewer.session import CONTROL, ViewerSession
 from us_sim.viewer.status import StatusListener
-from us_sim.viewer.stream import Posted, Simulator
+from us_sim.viewer.stream import CallPoster, Simulator
 
 _IMAGED_WITH = ("gain", "dynamic_range", "focus")
 """Parameters of ``slice_interpolator`` that pages are told with each image."""
@@ -39,9 +39,9 @@ class Viewer(GuardedNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("viewer", **kwargs)
-        settings = declared(self, ViewerSettings())
+        settings = declare_settings(self, ViewerSettings())
         self.health = Health(self, f"{settings.host}:{settings.port}")
-        post = Posted(self)
+        post = CallPoster(self)
         folder = os.path.abspath(os.path.expanduser(settings.recordings or ""))
         self._session = ViewerSession(
             self,
@@ -49,20 +49,20 @@ class Viewer(GuardedNode):
             folder if settings.recordings else "",
             is_own=is_loopback(settings.host),
         )
-        self._remote = RemoteParameters(self, {CONTROL: self._session.ask})
+        self._remote = RemoteParameters(self, {CONTROL: self._session.ask_control})
         self.simulator = Simulator(
             nodes=self._remote,
             status=StatusListener(self, post),
             session=self._session,
         )
-        add_score(self, post, self.simulator)
-        rest = RestMesh(self)
+        connect_scorer(self, post, self.simulator)
+        rest = RestMeshListener(self)
         self._hand = ViewerHand(self, post, self.simulator, rest)
         self._probe = ProbeFeeds(self, post, settings.rate)
         structures = StructuresFeed(self, post, rest)
-        self._session.on_other_scene = structures.forget
-        self.simulator.add(
-            *image_feeds(self, post, settings.rate, self._known, self._arranged),
+        self._session.on_other_scene = structures.forget_structures
+        self.simulator.add_feeds(
+            *make_image_feeds(self, post, settings.rate, self._known, self._arranged),
             *SkinFeeds(self, post, settings.rate).feeds,
             *self._probe.feeds,
             *TissueFeeds(self, post, settings.rate, rest).feeds,
@@ -82,7 +82,7 @@ class Viewer(GuardedNode):
 
     @property
     def _imaging(self) -> Mapping[str, Parameter]:
-        return self._remote.of("slice_interpolator").parameters
+        return self._remote.get_node("slice_interpolator").parameters
 
     def _arranged(self) -> tuple[bool, bool]:
         flip, beside = map(self._imaging.get, ("flip", "beside"))
@@ -95,14 +95,14 @@ class Viewer(GuardedNode):
         for it, of the last command that is seen in the image, so that the page can tell how long
         that took.
         """
-        probe = self._probe.at(str(stamp))
+        probe = self._probe.find_pose_and_wrench(str(stamp))
         parameters = self._imaging
         told = {
-            **self._hand.pose_facts(stamp, probe.get("position")),
+            **self._hand.describe_pose(stamp, probe.get("position")),
             "force": float(np.linalg.norm(probe["force"])) if "force" in probe else None,
             "scene": self._session.state.scene or None,
             "settings": {
-                in_words(name): f"{parameter.value:g} {parameter.unit}"
+                format_name(name): f"{parameter.value:g} {parameter.unit}"
                 for name in _IMAGED_WITH
                 if (parameter := parameters.get(name)) is not None and parameter.value is not None
             },

@@ -44,9 +44,9 @@ class VolumeSettings(Settings):
         """Refuse several of a file, a case and a phantom, or none."""
         given = [key for key in ("file", "case", "phantom") if getattr(self, key)]
         if len(given) > 1:
-            raise self.refused("", f"has both `{given[0]}` and `{given[1]}`; keep one")
+            raise self.make_error("", f"has both `{given[0]}` and `{given[1]}`; keep one")
         if not given:
-            raise self.refused(
+            raise self.make_error(
                 "file", "is missing; name a file in the scene file, or give one with --volume"
             )
 

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from functools import cache
 
 from us_sim.share import shared_path
-from us_sim.tissue.elasticity.material import kind_of
+from us_sim.tissue.elasticity.material import guess_tissue_kind
 
 _PHRASES = re.compile(r"\b(?:gr[ae]y|white) (?=matter\b)")
 
@@ -21,7 +21,7 @@ _NUMERAL = re.compile(r"\d{1,2}|[ivx]{1,4}[ab]?|[a-d]|[lctsr]\d{1,2}")
 
 def is_anatomical(name: str) -> bool:
     """Whether a name is made of words of anatomy, sides and numbers up to two digits alone."""
-    words = _PHRASES.sub("", readable(name).lower()).split()
+    words = _PHRASES.sub("", make_readable(name).lower()).split()
     others = [word for word in words if word not in _words()]
     return len(others) < len(words) <= 8 and all(map(_NUMERAL.fullmatch, others))
 
@@ -36,7 +36,7 @@ def _words() -> frozenset[str]:
     return frozenset(shared_path("config/anatomy.txt").read_text(encoding="utf-8").split())
 
 
-def readable(name: str) -> str:
+def make_readable(name: str) -> str:
     """A name with blanks in place of underscores, dots and hyphens, as programs write them."""
     return " ".join(re.sub(r"[_\-.,]+", " ", name).split())
 
@@ -60,24 +60,24 @@ _COLOURS: dict[str, Colour] = {
 _ANY_OTHER: Colour = (0.7, 0.6, 0.55)
 
 
-def anatomical_colour(name: str) -> Colour:
+def choose_colour(name: str) -> Colour:
     """Return red, green and blue of a structure, by the kind of tissue that its name says."""
-    return _COLOURS.get(kind_of(name), _ANY_OTHER)
+    return _COLOURS.get(guess_tissue_kind(name), _ANY_OTHER)
 
 
 _SHADES = (0.0, 0.45, 0.25, 0.65)  # part of white in the first, second, ... of one colour
 
 
-def anatomical_colours(names: Iterable[str]) -> dict[str, Colour]:
-    """Return colours of structures by name; what has the same `anatomical_colour` gets shades.
+def choose_colours(names: Iterable[str]) -> dict[str, Colour]:
+    """Return colours of structures by name; what has the same `choose_colour` gets shades.
 
-    >>> anatomical_colours(["portal vein", "hepatic vein", "liver"])["hepatic vein"]
+    >>> choose_colours(["portal vein", "hepatic vein", "liver"])["hepatic vein"]
     (0.588, 0.67, 0.917)
     """
     seen: Counter[Colour] = Counter()
     colours = {}
     for name in names:
-        colour = anatomical_colour(name)
+        colour = choose_colour(name)
         white = _SHADES[seen[colour] % len(_SHADES)]
         seen[colour] += 1
         red, green, blue = (round(part + white * (1.0 - part), 3) for part in colour)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.structure_names import Colour, anatomical_colours
+from us_sim.volume.structure_names import Colour, choose_colours
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,12 +66,12 @@ class Volume:
     @cached_property
     def extent(self) -> NDArray[np.float64]:
         """(2, 3) m, lower and upper corner of the box in ``patient`` around all voxels' faces."""
-        extent = grid_extent(self.index_to_patient, self.shape)
+        extent = compute_grid_extent(self.index_to_patient, self.shape)
         extent.flags.writeable = False
         return extent
 
 
-def grid_extent(
+def compute_grid_extent(
     index_to_patient: NDArray[np.float64], shape: tuple[int, int, int]
 ) -> NDArray[np.float64]:
     """(2, 3) m, lower and upper corner of the box in ``patient`` around a grid's voxels."""
@@ -115,7 +115,7 @@ class LabelMap:
     remarks: tuple[str, ...] = ()  # on how they came about, a sentence each
 
     def __post_init__(self) -> None:
-        usual = anatomical_colours(self.names.values())
+        usual = choose_colours(self.names.values())
         colours = {n: self.colours.get(n) or usual[name] for n, name in self.names.items()}
         object.__setattr__(self, "colours", colours)
 
@@ -126,6 +126,6 @@ class LabelMap:
         counts = np.sum([np.bincount(one.ravel(), minlength=256) for one in self.labels], axis=0)
         return {name: int(counts[label]) for label, name in self.names.items()}
 
-    def on(self, volume: Volume) -> Volume:
+    def apply_to(self, volume: Volume) -> Volume:
         """Return a volume of the same grid with these labels."""
         return dataclasses.replace(volume, labels=self.labels, label_names=self.names)

@@ -13,24 +13,24 @@ from us_sim.evaluation.hand.hand_motion import KINDS, HandMotion
 from us_sim.evaluation.hand.measure import (
     BEGINS,
     CONVERGED,
-    Converged,
-    Motion,
-    converged,
-    follow,
+    ArmMotion,
+    ConvergedAnswer,
+    follow_motion,
+    follow_to_convergence,
 )
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.fem_cg import FemCg
 
-MODEL = TissueModel.block(nodes=(5, 5, 4))
-MOTION = Motion("pressing", "brisk", 8, 0.5)
+MODEL = TissueModel.make_block(nodes=(5, 5, 4))
+MOTION = ArmMotion("pressing", "brisk", 8, 0.5)
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """A tissue that costs nothing."""
-    monkeypatch.setattr(following, "arm", lambda: MODEL)
+    monkeypatch.setattr(following, "load_arm", lambda: MODEL)
     shallow = HandMotion("down and up", (0.0, 0.0, -0.002), (0.0, 0.0, 0.008))
     for kind in ("free", "pressing"):
         monkeypatch.setitem(KINDS, kind, shallow)
@@ -41,7 +41,7 @@ def answer():
     count = len(MOTION.poses)
     nodes = MODEL.mesh.nodes + 1e-5 * np.arange(count)[:, None, None] * [0.0, 0.0, 1.0]
     nodes[:, MODEL.fixed] = MODEL.mesh.nodes[MODEL.fixed]
-    return Converged(nodes, np.zeros(count))
+    return ConvergedAnswer(nodes, np.zeros(count))
 
 
 class Oracle:
@@ -69,7 +69,7 @@ class Oracle:
 
 def test_what_knows_the_answer_has_no_error_and_skips_nothing(monkeypatch):
     live_by_its_own_clock(monkeypatch, solver := Oracle(answer()))
-    row = follow(solver, MOTION, answer())
+    row = follow_motion(solver, MOTION, answer())
     assert row["frames"] == len(MOTION.poses) - BEGINS == 30
     assert row["error_mm_worst"] == row["live_skipped"] == row["frames_inverted"] == 0.0
 
@@ -77,7 +77,7 @@ def test_what_knows_the_answer_has_no_error_and_skips_nothing(monkeypatch):
 def test_what_has_not_converged_is_compared_with_nothing():
     known = answer()
     known.residual[BEGINS + 4 :] = 0.1
-    row = follow(Oracle(known), MOTION, known)
+    row = follow_motion(Oracle(known), MOTION, known)
     assert row["not_compared"] == 26
     assert row["error_mm_worst"] == 0.0
 
@@ -87,7 +87,7 @@ def test_inverted_tetrahedra_are_seen_in_the_nodes():
         nodes[:, 2] *= -1.0
         return nodes
 
-    row = follow(Oracle(answer(), spoil=crushed), MOTION, answer())
+    row = follow_motion(Oracle(answer(), spoil=crushed), MOTION, answer())
     assert set(row["every"]["inverted"]) == {len(MODEL.mesh.tetrahedra)}
     assert row["frames_inverted"] == 30
     assert row["live_frames_inverted"] == 30
@@ -103,7 +103,7 @@ def test_live_the_newest_pose_wins(monkeypatch):
     # 40 ms a frame at 60 Hz: the first pose at 0, then those that came last by 40, 80, 120 ms.
     solver = Oracle(answer(), takes=0.040)
     live_by_its_own_clock(monkeypatch, solver)
-    row = follow(solver, MOTION, answer())
+    row = follow_motion(solver, MOTION, answer())
     expected = [int(0.040 * k * 60 + 1e-6) for k in range(25)]
     assert solver.seen == expected
     counted = [k for k in expected if k >= BEGINS]
@@ -119,9 +119,11 @@ def test_live_the_newest_pose_wins(monkeypatch):
 def test_the_converged_answer_does_not_depend_on_the_way():
     straight = [Pose(position=[0.0, 0.0, 0.008])]
     around = [Pose(position=[x, 0.0, z]) for x, z in ((0.004, 0.004), (0.002, 0.01))] + straight
-    found = converged(MODEL, around)
+    found = follow_to_convergence(MODEL, around)
     assert found.residual.max() <= CONVERGED
-    assert found.nodes[-1] == pytest.approx(converged(MODEL, straight).nodes[-1], abs=2e-7)
+    assert found.nodes[-1] == pytest.approx(
+        follow_to_convergence(MODEL, straight).nodes[-1], abs=2e-7
+    )
 
 
 class Raising(FemCg):
@@ -142,7 +144,9 @@ def test_the_report_has_a_row_for_each_method_and_says_what_broke(tmp_path, monk
         lambda name, m, **s: Raising(m) if name == "fem_cg" else made(name, m, **s),
     )
     monkeypatch.setattr(Raising, "warm_up", lambda _: None)
-    monkeypatch.setattr(hand, "motions", lambda _, seed: [replace(MOTION, kind="free", seed=seed)])
+    monkeypatch.setattr(
+        hand, "list_motions", lambda _, seed: [replace(MOTION, kind="free", seed=seed)]
+    )
     assert hand.HAND(tmp_path / "out", True) == 1
     with (tmp_path / "out" / "hand.csv").open(newline="", encoding="utf-8") as stream:
         rows = {row["method"]: row for row in csv.DictReader(stream)}

@@ -2,7 +2,7 @@
 
 import pytest
 
-from us_sim.evaluation.latency.measure import Case, row_of, run_case
+from us_sim.evaluation.latency.measure import LatencyCase, make_row, run_case
 
 PERIOD = 16_000_000  # ns
 
@@ -20,7 +20,7 @@ def heard(count=101, *, nodes=5.0, image=9.0, without=()):
 
 
 def test_ages_counts_and_ways_are_those_of_what_was_heard():
-    row = row_of(heard(without=(3, 40, 100)), 97, {})
+    row = make_row(heard(without=(3, 40, 100)), 97, {})
     # Of the last pose the image may yet come.
     assert (row["poses"], row["images"], row["dropped"]) == (101, 98, 2)
     assert row["not_recorded"] == 1
@@ -30,7 +30,7 @@ def test_ages_counts_and_ways_are_those_of_what_was_heard():
 
 
 def test_a_running_graph_is_heard_and_recorded():
-    (row,) = run_case(Case(seconds=1.0, realtime=False))
+    (row,) = run_case(LatencyCase(seconds=1.0, realtime=False))
     assert row["poses"] > 20
     assert row["images"] > 5  # of a busy machine
     assert row["not_recorded"] == 0

@@ -42,7 +42,7 @@ def test_faces_of_a_homogeneous_deformation_and_what_is_between_are_interpolated
     depth = np.minimum(places, _SIZE - places).min(axis=1)
     near, inside = places[depth < 0.1 * _SIZE], places[depth >= 0.1 * _SIZE]
     box = PrescribedBox(near, near @ slope.T, _SIZE / 6)
-    assert abs(box.at(box.harmonic, inside) - inside @ slope.T).max() < 1e-5 * _SIZE
+    assert abs(box.interpolate_field(box.harmonic, inside) - inside @ slope.T).max() < 1e-5 * _SIZE
 
 
 @pytest.mark.slow
@@ -63,19 +63,24 @@ def test_an_inhomogeneous_deformation_is_that_of_quadratic_elements_of_another_p
     inside = ((other.nodes > 1e-9) & (other.nodes < _SIZE - 1e-9)).all(axis=1)
     free = np.repeat(inside, 3)
     for _ in range(12):
-        slope = -other.forces(field).ravel()[free]
-        matrix = other.stiffness(field).tocsc()[free][:, free]
+        slope = -other.compute_forces(field).ravel()[free]
+        matrix = other.assemble_stiffness(field).tocsc()[free][:, free]
         field[inside] += spsolve(matrix, slope).reshape(-1, 3)
-    assert abs(other.forces(field)[inside]).max() < 1e-9 * abs(other.forces(field)).max()
+    assert (
+        abs(other.compute_forces(field)[inside]).max()
+        < 1e-9 * abs(other.compute_forces(field)).max()
+    )
 
     monkeypatch.setattr(hydrogel, "fit_near", lambda *of, **_: faces(of[2]))
     points = np.random.default_rng(0).uniform(0.1 * _SIZE, 0.9 * _SIZE, (400, 3))
-    expected = other.at(field, points)
+    expected = other.interpolate_field(field, points)
     errors = []
     for cells in (8, 16):
         box = PrescribedBox(points, points, _SIZE / cells)
-        errors.append(_length(box.at(box.equilibrium(ratio), points) - expected))
-    mechanics = _length(box.at(box.harmonic, points) - expected)
+        errors.append(
+            _length(box.interpolate_field(box.find_equilibrium(ratio), points) - expected)
+        )
+    mechanics = _length(box.interpolate_field(box.harmonic, points) - expected)
     assert errors[1] < 0.5 * errors[0]
     assert errors[1] < 0.1 * mechanics
 

@@ -10,11 +10,11 @@ from us_sim.evaluation.measured.silicone import (
     COMPRESSIONS,
     HEIGHT,
     RADIUS,
-    at,
+    compute_slipping_force,
+    find_index,
     predict_silicones,
     read_silicones,
     read_test,
-    slipping_force,
 )
 
 
@@ -50,7 +50,7 @@ def test_forces_of_a_test_at_1_to_15_mm_are_those_known(silicones, name, forces)
 def test_published_fits_of_yeohs_law_give_the_forces(compressions, silicones):
     published = json.loads((compressions / "data/hyperelastic_parameters.json").read_text())
     assert len(silicones) == 19
-    some = [at(compression) for compression in (0.2, 0.4, 0.6)]
+    some = [find_index(compression) for compression in (0.2, 0.4, 0.6)]
     errors = []
     for name, silicone in silicones.items():
         first, second, third = published["engineering"][name]["Yeoh_o3"]["parameters"]  # kPa
@@ -81,7 +81,7 @@ def write_test(file, forces):
 def test_the_modulus_of_a_made_up_silicone_is_found_and_its_forces_predicted(tmp_path):
     for specimen in "AB":
         file = tmp_path / "EF" / f"EF_{specimen}1.csv"
-        write_test(file, 5e3 * slipping_force(COMPRESSIONS))
+        write_test(file, 5e3 * compute_slipping_force(COMPRESSIONS))
     assert max(row["error"] for row in predict_silicones(tmp_path)) < 0.2  # %
 
 

@@ -8,34 +8,34 @@ from us_sim.evaluation.measured.vein import (
     MODULI,
     VENOUS,
     measure_closing,
-    press,
+    press_vein,
 )
 
 
 @pytest.fixture(scope="module")
 def lying():
     """The vein of somebody who lies, pressed in ten steps, which takes seconds."""
-    return press(VENOUS["lying"], 10)
+    return press_vein(VENOUS["lying"], 10)
 
 
 @pytest.mark.slow
 def test_a_vein_of_higher_pressure_closes_at_a_higher_one(lying):
-    low, high = lying, press(VENOUS["standing"], 10)
+    low, high = lying, press_vein(VENOUS["standing"], 10)
     assert low.area[0] == high.area[0] == 1.0
     assert (high.area[1:] >= low.area[1:]).all()
-    assert high.at(0.5) > low.at(0.5) + 10.0
-    assert np.isnan(low.at(0.0))
+    assert high.find_pressure(0.5) > low.find_pressure(0.5) + 10.0
+    assert np.isnan(low.find_pressure(0.0))
 
 
 @pytest.mark.slow
 def test_softer_tissue_lets_the_vein_close_at_less(lying):
-    soft = press(VENOUS["lying"], 10, MODULI["of volunteers"])
-    assert soft.at(0.5) < lying.at(0.5) - 3.0
+    soft = press_vein(VENOUS["lying"], 10, MODULI["of volunteers"])
+    assert soft.find_pressure(0.5) < lying.find_pressure(0.5) - 3.0
 
 
 @pytest.mark.slow
 def test_pressures_are_read_where_the_vein_counts_as_closed(lying, monkeypatch):
-    monkeypatch.setattr(vein, "press", lambda *_: lying)
+    monkeypatch.setattr(vein, "press_vein", lambda *_: lying)
     (row,) = measure_closing("lying", "of the scene", 10)
-    assert row["predicted"] == lying.at(0.2)
+    assert row["predicted"] == lying.find_pressure(0.2)
     assert row["error"] == pytest.approx(row["predicted"] - 22.5)

@@ -10,12 +10,12 @@ from us_sim.evaluation.stability.cases import (
     HOLD,
     SMALL,
     StabilityCase,
-    held_cases,
-    model_of,
+    make_model,
+    sample_held_cases,
 )
 from us_sim.evaluation.stability.measure import (
     Trial,
-    agrees,
+    is_residual_true,
     run_trial,
     try_case,
 )
@@ -75,7 +75,7 @@ class Stuck(FemCg):
 
 def tried(solver, case=CASE):
     trial = Trial()
-    model = model_of(case)
+    model = make_model(case)
     run_trial(solver(model), TISSUE_METHODS["fem_cg"].equations(model), case, trial)
     return trial
 
@@ -112,7 +112,7 @@ class LyingOfSurfaces(FemNonlinear):
 
 @pytest.mark.slow
 def test_a_solver_that_understates_what_the_surface_leaves_is_caught():
-    trial, model = Trial(), model_of(CASE)
+    trial, model = Trial(), make_model(CASE)
     equations = TISSUE_METHODS["fem_nonlinear"].equations(model)
     run_trial(LyingOfSurfaces(model), equations, CASE, trial)
     assert not trial.truthful
@@ -162,7 +162,7 @@ def test_a_good_solver_comes_to_balance_under_a_held_probe():
 
 def test_tissue_whose_forces_are_in_balance_before_its_nodes_comes_to_balance():
     # Its residual falls below the frame's tolerance while the displacement's error is above.
-    trial = try_case("fem_nonlinear", held_cases(40, seed=7)[23])
+    trial = try_case("fem_nonlinear", sample_held_cases(40, seed=7)[23])
     assert trial.held[-1] <= 1e-5
 
 
@@ -184,7 +184,7 @@ def test_linear_strain_that_turns_tetrahedra_inside_out_is_caught():
 @pytest.mark.slow
 @pytest.mark.parametrize(("number", "seed"), [(135, 1), (90, 2), (664, 1), (988, 1)])
 def test_a_probe_in_tissue_of_soft_and_stiff_parts_turns_nothing_inside_out(number, seed):
-    trial = try_case("fem_nonlinear", held_cases(number + 1, seed)[number])
+    trial = try_case("fem_nonlinear", sample_held_cases(number + 1, seed)[number])
     assert not trial.failure
     assert trial.held_inverted == 0
     assert trial.held[-1] <= SMALL
@@ -203,13 +203,13 @@ def test_a_probe_in_tissue_of_soft_and_stiff_parts_turns_nothing_inside_out(numb
     ],
 )
 def test_a_residual_is_true_that_is_not_below_half_of_the_least(reported, checked, rounding, true):
-    assert agrees(reported, checked, rounding) is true
+    assert is_residual_true(reported, checked, rounding) is true
 
 
 @pytest.mark.slow
 def test_the_report_has_a_row_for_each_case_and_figures(tmp_path, monkeypatch, capsys):
     many = StabilityCase("many steps", time_step=10.0, stabilisation="substeps")
-    cases = [CASE, many, *held_cases(1, seed=3)]
+    cases = [CASE, many, *sample_held_cases(1, seed=3)]
     for name in {*TISSUE_METHODS} - {"fem_cg", "msds"}:
         monkeypatch.delitem(TISSUE_METHODS, name)
     subject = replace(STABILITY, pieces=lambda _: {"stability": plan_cases(cases)})

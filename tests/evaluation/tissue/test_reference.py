@@ -6,12 +6,12 @@ from skfem import Basis, ElementHex2, ElementVector, MeshHex
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 from us_sim.errors import SolverError
-from us_sim.evaluation.block import graded_planes
+from us_sim.evaluation.block import make_graded_planes
 from us_sim.evaluation.tissue.cases import SCENES
 from us_sim.evaluation.tissue.finite_elements import NeoHookeanHexahedra
 from us_sim.evaluation.tissue.reference import solve_contact
 from us_sim.geometry.collider import Capsule, Sphere
-from us_sim.geometry.collider_distance import signed_distance
+from us_sim.geometry.collider_distance import measure_distances
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
 
@@ -22,7 +22,7 @@ PLANES = ([-0.03, 0.0, 0.01], [0.0, 0.02, 0.05], [0.0, 0.015, 0.04])
 def test_a_uniform_stretch_has_the_published_stress_in_every_element():
     block = NeoHookeanHexahedra(PLANES, SOFT)
     stretch = np.array([[1.3, 0.2, 0.0], [-0.1, 0.8, 0.1], [0.0, 0.3, 0.9]])
-    forces = block.forces(block.nodes @ (stretch - np.eye(3)).T)
+    forces = block.compute_forces(block.nodes @ (stretch - np.eye(3)).T)
     # Smith, de Goes and Kim 2018, eq. 13 with lambda raised by mu (their eq. 16), no logarithm.
     shear = 10e3 / 2.9
     bulk = 10e3 * 0.45 / (1.45 * 0.1) + shear
@@ -36,7 +36,7 @@ def test_a_uniform_stretch_has_the_published_stress_in_every_element():
     moment = np.einsum("ni,nj->ij", forces, block.nodes)
     np.testing.assert_allclose(moment, stress * 0.04 * 0.05 * 0.04, rtol=1e-12, atol=1e-10)
     assert right.sum() == 25
-    volume = block.volume(block.nodes @ (stretch - np.eye(3)).T)
+    volume = block.compute_volume(block.nodes @ (stretch - np.eye(3)).T)
     assert volume == pytest.approx(ratio * 0.04 * 0.05 * 0.04, rel=1e-12)
 
 
@@ -52,7 +52,7 @@ def test_at_rest_the_stiffness_is_scikit_fems_own():
 
     field = displacement(block.nodes)
     values = displacement(basis.doflocs.T)[np.arange(basis.N), np.arange(basis.N) % 3]
-    ours = field.ravel() @ (block.stiffness(np.zeros_like(field)) @ field.ravel())
+    ours = field.ravel() @ (block.assemble_stiffness(np.zeros_like(field)) @ field.ravel())
     assert ours == pytest.approx(values @ (theirs @ values), rel=1e-12)
 
 
@@ -65,16 +65,16 @@ def test_a_cubic_displacement_without_change_of_volume_costs_only_shear_energy()
     # mu times the integral of the squared strain, 18 x^4 + 18 x^2 y^2.
     shear = 10e3 / (2 * 1.49)
     expected = shear * scale**2 * 0.01 * (18 / 5 * 0.04**5 * 0.02 + 2 * 0.04**3 * 0.02**3)
-    assert block.energy(displacement) == pytest.approx(expected, rel=0.02)
+    assert block.compute_energy(displacement) == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.slow
 def test_a_shallow_press_has_hertz_force():
     depth = 0.0004
     planes = (
-        graded_planes(-0.05, 0.05, -0.004, 0.004, 0.002, 2.0),
-        graded_planes(0.0, 0.05, 0.0, 0.004, 0.002, 2.0),
-        graded_planes(0.0, 0.07, 0.0, 0.002, 0.002, 2.0),
+        make_graded_planes(-0.05, 0.05, -0.004, 0.004, 0.002, 2.0),
+        make_graded_planes(0.0, 0.05, 0.0, 0.004, 0.002, 2.0),
+        make_graded_planes(0.0, 0.07, 0.0, 0.002, 0.002, 2.0),
     )
     solution = solve_contact(planes, SOFT, Sphere(0.03), [Pose([0.0, 0.0, depth])])
     expected = 4 / 3 * 10e3 / (1 - 0.45**2) * np.sqrt(0.03) * depth**1.5
@@ -86,14 +86,14 @@ def test_a_shallow_press_has_hertz_force():
 def test_a_tilted_capsule_pushes_everything_out_and_is_mirrored():
     half = np.radians(8) / 2
     pose = Pose([0.0, 0.0, 0.006], [0.0, np.sin(half), 0.0, np.cos(half)])
-    planes = SCENES["tilt"].reference_planes(0.02)
+    planes = SCENES["tilt"].make_reference_planes(0.02)
     probe = Capsule(0.025, 0.04)
     solution = solve_contact(planes, SOFT, probe, [Pose([0.0, 0.0, 0.003]), pose])
     block = solution.block
     surface = block.surface_points + block.surface_values @ solution.displacement
-    assert signed_distance(probe, pose, surface)[0].min() > -2e-5
+    assert measure_distances(probe, pose, surface)[0].min() > -2e-5
     points = np.array([[0.03, 0.02, 0.01], [0.03, -0.02, 0.01]])
-    found = solution.at(points)
+    found = solution.interpolate_displacement(points)
     np.testing.assert_allclose(found[1], found[0] * [1, -1, 1])
     with pytest.raises(SolverError, match="symmetric about y = 0"):
         solve_contact(planes, SOFT, probe, [Pose([0.0, 0.001, 0.0])])

@@ -14,7 +14,7 @@ from us_sim.command.main import main
 from us_sim.evaluation.subject import Piece
 from us_sim.evaluation.tissue import report as tissue
 from us_sim.evaluation.tissue.cases import SCENES
-from us_sim.evaluation.tissue.measure import Bench, Outcome, compare
+from us_sim.evaluation.tissue.measure import PathOutcome, TissueBench, compare_outcomes
 from us_sim.evaluation.tissue.report import TISSUE
 from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
 
@@ -26,13 +26,15 @@ PRESS = SCENES["press_25mm"]
 
 
 def test_errors_of_a_known_field_are_what_they_are_by_hand():
-    model = PRESS.model((5, 4, 4))
+    model = PRESS.make_model((5, 4, 4))
     nodes = model.mesh.nodes
-    exact = Outcome(nodes * [0, 0, -0.1], -4.0, 0.0018)
+    exact = PathOutcome(nodes * [0, 0, -0.1], -4.0, 0.0018)
     wrong = nodes * [0, 0, -0.1]
     wrong[7] += [0.003, 0.0, 0.004]
-    found = Outcome(wrong, -5.0, signed_volumes(nodes * [1, 1, 1.2], model.mesh.tetrahedra).sum())
-    errors = compare(found, exact, 0.002)
+    found = PathOutcome(
+        wrong, -5.0, signed_volumes(nodes * [1, 1, 1.2], model.mesh.tetrahedra).sum()
+    )
+    errors = compare_outcomes(found, exact, 0.002)
     assert errors["rel_l2_error"] == pytest.approx(0.005 / np.linalg.norm(0.1 * nodes[:, 2]))
     assert errors["max_error_mm"] == pytest.approx(5.0)
     assert errors["force_error"] == pytest.approx(0.25)
@@ -46,14 +48,14 @@ def small(monkeypatch, tmp_path):
     monkeypatch.setattr(tissue, "_NODES", 7 * 4 * 4)
 
     def pieces(_quick):
-        bench = Bench()
+        bench = TissueBench()
 
         def trial(method, setting):
             case = {"scene": PRESS.name, "method": method, "nodes": 112, "tets": 270}
             case |= {"threads": 1, "setting": str(setting) if setting else "default"}
-            return Piece(case, partial(bench.run, PRESS, (7, 4, 4), method, setting))
+            return Piece(case, partial(bench.run_method, PRESS, (7, 4, 4), method, setting))
 
-        solve = partial(bench.solve_reference, PRESS, (0.03, 0.025))
+        solve = partial(bench.measure_reference, PRESS, (0.03, 0.025))
         trials = [trial("fem_cg", {}), trial("fem_cg", {"iterations": -1}), trial("fem", {})]
         return {"references": [Piece({"scene": PRESS.name}, solve)], "tissue": trials}
 

@@ -16,7 +16,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.scene.reading import parse_scene
 from us_sim.slicing.acoustics.settings import Acoustics, TissueAcoustics
 from us_sim.slicing.acoustics.surface_echo import MIRROR, ROUGHNESS, SurfaceNormals
-from us_sim.slicing.b_mode import BMode, beyond
+from us_sim.slicing.b_mode import BMode, measure_excess_depth
 from us_sim.slicing.formation.image_formation import GREYS_PER_DECIBEL
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe
 from us_sim.slicing.settings import ECHO_RANGE, Imaging
@@ -41,8 +41,8 @@ def ball(label, radius=4e-3, centre=(0.0, 0.0, 0.012)):
 
 @pytest.mark.slow
 def test_off_imports_nothing_and_changes_nothing():
-    baked = BMode(ball(3), PROBE, acoustics=Acoustics()).image(Pose())
-    np.testing.assert_array_equal(baked, BMode(ball(3), PROBE).image(Pose()))
+    baked = BMode(ball(3), PROBE, acoustics=Acoustics()).render_image(Pose())
+    np.testing.assert_array_equal(baked, BMode(ball(3), PROBE).render_image(Pose()))
     code = (
         "import sys; from us_sim.slicing.b_mode import BMode; "
         "from us_sim.slicing.acoustics.settings import Acoustics; "
@@ -57,10 +57,10 @@ def test_behind_bone_is_dark_and_behind_blood_is_bright():
     plain = dataclasses.replace(LIVE, surfaces=False)
     beside = (slice(90, 110), slice(2, 12))
     behind = (slice(90, 110), slice(55, 65))
-    bone = BMode(ball(2), PROBE, acoustics=plain).image(Pose())
+    bone = BMode(ball(2), PROBE, acoustics=plain).render_image(Pose())
     assert bone[behind].mean() < 40
     assert bone[beside].mean() == pytest.approx(150, abs=1)
-    blood = BMode(ball(3), PROBE, acoustics=plain).image(Pose())
+    blood = BMode(ball(3), PROBE, acoustics=plain).render_image(Pose())
     assert blood[behind].mean() > blood[beside].mean() + 10
     assert blood[beside].mean() == pytest.approx(150, abs=1)
 
@@ -72,16 +72,16 @@ def test_every_way_of_cutting_has_the_same_acoustics():
     images = []
     for name in ("per_pixel", "scan_conversion"):
         scanner = BMode(ball(2), PROBE, acoustics=LIVE, method=name)
-        scanner.carry(mesh.nodes, mesh.tetrahedra)
-        images.append(scanner.image(Pose(), pressed).astype(int))
+        scanner.attach_mesh(mesh.nodes, mesh.tetrahedra)
+        images.append(scanner.render_image(Pose(), pressed).astype(int))
     assert np.percentile(np.abs(images[0] - images[1]), 99) <= 1
 
 
 def test_the_same_image_comes_out_again_and_noise_differs_from_pose_to_pose():
     loud = BMode(ball(1), PROBE, acoustics=dataclasses.replace(LIVE, noise=-40.0))
-    first = loud.image(Pose())
-    np.testing.assert_array_equal(first, loud.image(Pose()))
-    others = [loud.image(Pose(np.array([x, 0.0, 0.0]))) for x in (1e-4, 2e-4, 3e-4, 4e-4)]
+    first = loud.render_image(Pose())
+    np.testing.assert_array_equal(first, loud.render_image(Pose()))
+    others = [loud.render_image(Pose(np.array([x, 0.0, 0.0]))) for x in (1e-4, 2e-4, 3e-4, 4e-4)]
     assert any((other != first).mean() > 0.2 for other in others)
 
 
@@ -89,7 +89,7 @@ def test_half_the_frequency_loses_half_the_level():
     plain = dataclasses.replace(LIVE, compensation=0.0, surfaces=False)
     low, high = (
         BMode(ball(1), PROBE, acoustics=dataclasses.replace(plain, frequency=f))
-        .image(Pose())[60:100]
+        .render_image(Pose())[60:100]
         .mean()
         for f in (4e6, 8e6)
     )
@@ -99,7 +99,9 @@ def test_half_the_frequency_loses_half_the_level():
 def test_a_frequency_below_the_volumes_own_blurs():
     low = dataclasses.replace(LIVE, frequency=4e6)
     blurred = dataclasses.replace(low, volume_frequency=8e6)
-    sharp, soft = (BMode(ball(3), PROBE, acoustics=one).image(Pose()) for one in (low, blurred))
+    sharp, soft = (
+        BMode(ball(3), PROBE, acoustics=one).render_image(Pose()) for one in (low, blurred)
+    )
     steps = [int(np.abs(np.diff(image.astype(int), axis=0)).max()) for image in (sharp, soft)]
     assert steps[1] < 0.7 * steps[0]
 
@@ -131,7 +133,9 @@ def test_a_border_echoes_by_its_angle_as_facets_do(axis, degrees):
     fine = PROBE.with_pixels(512, 512)
     scanner = BMode(layers(0.0121, 40, {1: "above", 2: "below"}), fine, acoustics=sound)
     # The border is patchy: the mean of its brightest pixels, over its grain.
-    shown = [scanner.image(tilted(degrees, axis, y)).max(axis=0) for y in 5e-4 * np.arange(16)]
+    shown = [
+        scanner.render_image(tilted(degrees, axis, y)).max(axis=0) for y in 5e-4 * np.arange(16)
+    ]
     facets = np.exp(-(np.tan(np.radians(degrees)) ** 2) / (2 * ROUGHNESS**2))
     expected = MIRROR + 20.0 * np.log10(0.3 / 3.3 * facets)
     assert np.mean(shown) / GREYS_PER_DECIBEL - ECHO_RANGE == pytest.approx(expected, abs=1.0)
@@ -146,10 +150,10 @@ def test_fibres_are_brightest_across_the_beam(degrees, shear):
     sound = dataclasses.replace(LIVE, tissues={"muscle": muscle}, surfaces=False)
     scanner = BMode(layers(1.0, 150, {1: "muscle"}), PROBE, acoustics=sound)
     carrier = box_mesh(*(np.linspace(*side, 4) for side in ((-0.02, 0.02),) * 2 + ((0.0, 0.033),)))
-    scanner.carry(carrier.nodes, carrier.tetrahedra)
+    scanner.attach_mesh(carrier.nodes, carrier.tetrahedra)
     nodes = carrier.nodes.copy()
     nodes[:, 2] += shear * nodes[:, 1]
-    image = scanner.image(tilted(degrees, (1.0, 0.0, 0.0)), nodes)[30:90, 30:90]
+    image = scanner.render_image(tilted(degrees, (1.0, 0.0, 0.0)), nodes)[30:90, 30:90]
     square = np.sin(np.radians(degrees) - np.arctan(shear)) ** 2
     expected = -14.0 * square / (square + np.sin(0.3) ** 2)
     assert (image.mean() - 150) / GREYS_PER_DECIBEL == pytest.approx(expected, abs=0.1)
@@ -166,7 +170,7 @@ def test_the_walls_of_a_crushed_vein_are_drawn_without_steps(flat):
     scanner = BMode(dark, probe, acoustics=dataclasses.replace(LIVE, frequency=12e6, tissues=walls))
     depths = np.linspace(-0.002, 0.028, 14)
     mesh = box_mesh(np.linspace(0.0, 0.03, 9), [0.0, 0.002], depths)
-    scanner.carry(mesh.nodes, mesh.tetrahedra)
+    scanner.attach_mesh(mesh.nodes, mesh.tetrahedra)
     # Layers of tetrahedra that the vein lies in are crushed, others are not; all slope.
     crushed = (depths[1:] > middle - radius) & (depths[:-1] < middle + radius)
     heights = np.concatenate([[0.0], np.cumsum(np.diff(depths) * np.where(crushed, flat, 1.0))])
@@ -176,7 +180,7 @@ def test_the_walls_of_a_crushed_vein_are_drawn_without_steps(flat):
 
     nodes = mesh.nodes.copy()
     nodes[:, 2] = pressed(nodes[:, 0], nodes[:, 2])
-    image = scanner.image(Pose([0.0152, 0.001, 0.0]), nodes).astype(float)
+    image = scanner.render_image(Pose([0.0152, 0.001, 0.0]), nodes).astype(float)
     pixel = probe.depth / probe.rows
     column, row = np.arange(120, 200), np.arange(probe.rows)[:, None]
     x = 0.0152 + (column + 0.5) * pixel - 0.012
@@ -197,7 +201,7 @@ def test_normals_of_a_ball_of_voxels_point_to_its_middle(radius):
     found = SurfaceNormals(labels)
     angles, distances = [], []
     for voxel in np.argwhere(labels):
-        normal, distance = found.at(*voxel)
+        normal, distance = found.get_normal(*voxel)
         if normal.any():
             place = voxel - 15.3
             away = np.linalg.norm(place)
@@ -231,10 +235,10 @@ def test_a_volume_without_labels_is_refused_and_a_bad_change_keeps_what_was():
     with pytest.raises(ProbeError, match=r"artefacts: `live`"):
         BMode(bare, PROBE, acoustics=LIVE)
     scanner = BMode(ball(2), PROBE, acoustics=LIVE)
-    before = scanner.image(Pose())
+    before = scanner.render_image(Pose())
     with pytest.raises(ProbeError):
-        scanner.use(PROBE, Imaging(), dataclasses.replace(LIVE, frequency=40e6))
-    np.testing.assert_array_equal(scanner.image(Pose()), before)
+        scanner.apply_settings(PROBE, Imaging(), dataclasses.replace(LIVE, frequency=40e6))
+    np.testing.assert_array_equal(scanner.render_image(Pose()), before)
 
 
 SCENE = {
@@ -262,17 +266,24 @@ def test_a_scene_with_wrong_acoustics_is_refused_with_its_key(imaging, sentence)
 def test_an_image_that_is_deeper_than_a_box_says_by_how_much():
     box = np.array([[-0.1, -0.1, 0.0], [0.1, 0.1, 0.05]])
     deep = ConvexProbe(radius=0.05, opening_angle=1.0, depth=0.08)
-    assert beyond(deep, Pose(), box) == pytest.approx(0.03)
-    assert beyond(PROBE, Pose(), box) == 0.0
+    assert measure_excess_depth(deep, Pose(), box) == pytest.approx(0.03)
+    assert measure_excess_depth(PROBE, Pose(), box) == 0.0
     pressed = Pose(np.array([0.0, 0.0, 0.01]))
-    assert beyond(deep, pressed, box) == pytest.approx(0.04)
-    assert beyond(deep, pressed, box, pressed=False) == pytest.approx(0.03)
+    assert measure_excess_depth(deep, pressed, box) == pytest.approx(0.04)
+    assert measure_excess_depth(deep, pressed, box, pressed=False) == pytest.approx(0.03)
     lifted = Pose(np.array([0.0, 0.0, -0.01]))
-    assert beyond(deep, lifted, box, pressed=False) == pytest.approx(0.02)
-    assert beyond(deep, Pose(np.array([0.0, 0.0, -0.2])), box) == 0.0  # in the air above it
+    assert measure_excess_depth(deep, lifted, box, pressed=False) == pytest.approx(0.02)
+    assert (
+        measure_excess_depth(deep, Pose(np.array([0.0, 0.0, -0.2])), box) == 0.0
+    )  # in the air above it
     half = np.radians(30) / 2
     turned = Pose(np.zeros(3), np.array([0.0, np.sin(half), 0.0, np.cos(half)]))
-    assert beyond(deep, turned, box) == pytest.approx(0.08 - 0.05 / np.cos(np.radians(30)))
+    assert measure_excess_depth(deep, turned, box) == pytest.approx(
+        0.08 - 0.05 / np.cos(np.radians(30))
+    )
     # 45° towards the box from beside it: the beam leaves the box's layer of depth before its side.
     across = Pose(np.array([-0.08, 0.0, 0.03]), [0.0, np.sin(np.pi / 8), 0.0, np.cos(np.pi / 8)])
-    assert beyond(deep, across, np.array([[-0.05, -0.05, 0.0], [0.05, 0.05, 0.05]])) == 0.0
+    assert (
+        measure_excess_depth(deep, across, np.array([[-0.05, -0.05, 0.0], [0.05, 0.05, 0.05]]))
+        == 0.0
+    )

@@ -73,17 +73,17 @@ def test_an_affine_deformation_gives_the_affinely_resampled_image(method, seed):
     slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra)
     nodes = mesh.nodes @ matrix.T + shift
 
-    pixels = plane.pixels()
+    pixels = plane.compute_pixel_positions()
     rest = (pixels - shift) @ np.linalg.inv(matrix).T
     is_tissue = ((rest >= LOW) & (rest <= HIGH)).all(axis=-1)
     was_tissue = ((pixels >= LOW) & (pixels <= HIGH)).all(axis=-1)
     expected = np.where(is_tissue[..., None], rest, pixels)
     expected[was_tissue & ~is_tissue] = np.nan
-    found = slicer.rest_coordinates(nodes, plane)
+    found = slicer.compute_rest_coordinates(nodes, plane)
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-5)  # a hundredth of a voxel
 
     grey = np.floor(np.nan_to_num(grey_by_scipy(volume, expected)) + 0.5)
-    assert np.abs(slicer.image(nodes, plane) - grey).max() <= 1
+    assert np.abs(slicer.cut_image(nodes, plane) - grey).max() <= 1
     assert slicer.skipped == 0
 
 
@@ -123,7 +123,7 @@ def test_a_ball_under_an_affine_map_has_the_area_of_the_ellipse(method, seed):
     minor, major = np.sqrt(reach2 / np.linalg.eigvalsh(gram))[::-1]
     area, perimeter = np.pi * major * minor, np.pi * np.hypot(major, minor) * np.sqrt(2)
     slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra)
-    found = slicer.labels(mesh.nodes @ matrix.T + shift, plane).sum()
+    found = slicer.cut_labels(mesh.nodes @ matrix.T + shift, plane).sum()
     assert abs(found - area) <= perimeter
     assert abs(found - area) <= 0.02 * area + 5
 
@@ -136,7 +136,7 @@ def vessel(x, y, z, radius=0.01, depth=0.02):
 @every_method
 def test_a_vessel_pressed_more_near_the_skin_loses_the_area_that_the_map_takes(method):
     mesh, volume = box((9, 2, 26)), labelled(vessel)
-    plane = LinearProbe(0.06, 0.05, 240, 200).plane(Pose([0, 1e-3, 0]))
+    plane = LinearProbe(0.06, 0.05, 240, 200).make_plane(Pose([0, 1e-3, 0]))
 
     def squeezed(z):
         return z + 0.012 * (1 - z / SIZE[2]) ** 2
@@ -150,7 +150,7 @@ def test_a_vessel_pressed_more_near_the_skin_loses_the_area_that_the_map_takes(m
     )  # fmt: skip
     perimeter = 2 * np.pi * 0.01 / 0.00025
     slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra)
-    assert abs(slicer.labels(nodes, plane).sum() - area / 0.00025**2) <= perimeter / 4
+    assert abs(slicer.cut_labels(nodes, plane).sum() - area / 0.00025**2) <= perimeter / 4
 
 
 # --- symmetry -------------------------------------------------------------------------------------
@@ -165,10 +165,10 @@ def test_threads_do_not_change_a_byte(method, kind):
         one, *more = (
             create_slicer(method, volume, rest, tetrahedra, threads=n) for n in (1, 2, 3, 64)
         )
-        image, labels = one.image(nodes, plane), one.labels(nodes, plane)
+        image, labels = one.cut_image(nodes, plane), one.cut_labels(nodes, plane)
         for slicer in more:
-            np.testing.assert_array_equal(slicer.image(nodes, plane), image)
-            np.testing.assert_array_equal(slicer.labels(nodes, plane), labels)
+            np.testing.assert_array_equal(slicer.cut_image(nodes, plane), image)
+            np.testing.assert_array_equal(slicer.cut_labels(nodes, plane), labels)
             assert slicer.skipped == one.skipped
 
 
@@ -200,13 +200,13 @@ def test_what_just_touches_the_plane_is_shown(method, corners, count):
         plane = SlicePlane(
             turn.position, *(turn.rotation @ step for step in steps), columns=8, rows=8
         )
-        found = slicer.rest_coordinates(turn.apply(nodes), plane)
+        found = slicer.compute_rest_coordinates(turn.transform_points(nodes), plane)
         assert (found[..., 1] > 0.5).sum() == count
         off = turn.rotation @ [0.0, 1e-8, 0.0]
         beside = SlicePlane(
             turn.position + off, *(turn.rotation @ step for step in steps), columns=8, rows=8
         )
-        below = slicer.rest_coordinates(turn.apply(nodes), beside)[..., 1] > 0.5
+        below = slicer.compute_rest_coordinates(turn.transform_points(nodes), beside)[..., 1] > 0.5
         if (nodes[:, 1] <= 0).all():
             assert not below.any()
 
@@ -218,16 +218,16 @@ def test_what_just_touches_the_plane_is_shown(method, corners, count):
 def test_inverted_and_flat_tetrahedra_are_left_out_and_counted(method):
     mesh, volume = box_mesh([-0.02, 0.02], [-0.02, 0.02], [0.0, 0.04]), around_the_box()
     slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra)
-    plane = LinearProbe(0.03, 0.03, 40, 40).plane(Pose([0, 1e-3, 5e-3]))
-    assert np.isfinite(slicer.rest_coordinates(mesh.nodes, plane)).all()
+    plane = LinearProbe(0.03, 0.03, 40, 40).make_plane(Pose([0, 1e-3, 5e-3]))
+    assert np.isfinite(slicer.compute_rest_coordinates(mesh.nodes, plane)).all()
     assert slicer.skipped == 0
     # All five, of which the plane meets each: black, since they covered the plane at rest.
     mirrored = mesh.nodes * [1.0, 1.0, -1.0] + [0, 0, 0.04]
-    assert not slicer.image(mirrored, plane).any()
+    assert not slicer.cut_image(mirrored, plane).any()
     assert slicer.skipped >= 3
-    assert not slicer.image(mesh.nodes * [1.0, 0.0, 1.0] + [0, 1e-3, 0], plane).any()
+    assert not slicer.cut_image(mesh.nodes * [1.0, 0.0, 1.0] + [0, 1e-3, 0], plane).any()
     assert slicer.skipped == 5
-    assert np.isnan(slicer.rest_coordinates(mirrored, plane)).all()
+    assert np.isnan(slicer.compute_rest_coordinates(mirrored, plane)).all()
 
 
 @every_method
@@ -238,18 +238,21 @@ def test_only_the_inverted_tetrahedron_is_lost(method):
     tetrahedra = np.array([[0, 1, 2, 3], [0, 1, 2, 4]])
     volume = around_the_box()
     slicer = create_slicer(method, volume, rest, tetrahedra)
-    plane = LinearProbe(0.01, 0.024, 41, 97).plane(Pose([0, 1e-3, 0.0]))
+    plane = LinearProbe(0.01, 0.024, 41, 97).make_plane(Pose([0, 1e-3, 0.0]))
     nodes = rest.copy()
     nodes[4] = [0, 0, 0.014]
     alone = create_slicer(method, volume, rest, tetrahedra[:1])
-    below = plane.pixels()[:, 0, 2] > 0.01 + 1e-9
+    below = plane.compute_pixel_positions()[:, 0, 2] > 0.01 + 1e-9
     assert below.any()
     assert not below.all()
-    both, one = slicer.rest_coordinates(nodes, plane), alone.rest_coordinates(rest, plane)
+    both, one = (
+        slicer.compute_rest_coordinates(nodes, plane),
+        alone.compute_rest_coordinates(rest, plane),
+    )
     np.testing.assert_allclose(both[below], one[below], rtol=0, atol=2e-5)
     assert (slicer.skipped, alone.skipped) == (1, 0)
-    inside_lost = np.abs(plane.pixels()[..., 0]) < 5e-4
-    inside_lost &= (plane.pixels()[..., 2] > 5e-3) & ~below[:, None]
+    inside_lost = np.abs(plane.compute_pixel_positions()[..., 0]) < 5e-4
+    inside_lost &= (plane.compute_pixel_positions()[..., 2] > 5e-3) & ~below[:, None]
     assert inside_lost.any()
     assert np.isnan(both[inside_lost]).all()
 
@@ -260,15 +263,17 @@ def test_a_probe_outside_sees_nothing_and_a_plane_that_misses_sees_the_rigid_vol
     slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra)
     nodes = mesh.nodes * [1.0, 1.0, 0.9]
     probe = LinearProbe(0.04, 0.04, 32, 48)
-    far = probe.plane(Pose([0.5, 0.3, -0.4], [0.1, 0.2, 0.3, 1.0]))
-    assert not slicer.image(nodes, far).any()
-    assert not slicer.labels(nodes, far).any()
-    np.testing.assert_allclose(slicer.rest_coordinates(nodes, far), far.pixels(), atol=1e-12)
-    beside = probe.plane(Pose([0, SIZE[1] / 2 + 0.004, 0.005]))
-    assert slicer.image(nodes, beside).any()
+    far = probe.make_plane(Pose([0.5, 0.3, -0.4], [0.1, 0.2, 0.3, 1.0]))
+    assert not slicer.cut_image(nodes, far).any()
+    assert not slicer.cut_labels(nodes, far).any()
+    np.testing.assert_allclose(
+        slicer.compute_rest_coordinates(nodes, far), far.compute_pixel_positions(), atol=1e-12
+    )
+    beside = probe.make_plane(Pose([0, SIZE[1] / 2 + 0.004, 0.005]))
+    assert slicer.cut_image(nodes, beside).any()
     rigid = sample_plane(volume, beside).astype(int)
-    assert np.abs(slicer.image(nodes, beside) - rigid).max() <= 1
-    np.testing.assert_array_equal(slicer.labels(nodes, beside), sample_labels(volume, beside))
+    assert np.abs(slicer.cut_image(nodes, beside) - rigid).max() <= 1
+    np.testing.assert_array_equal(slicer.cut_labels(nodes, beside), sample_labels(volume, beside))
     assert slicer.skipped == 0
 
 
@@ -278,16 +283,16 @@ def test_nodes_that_are_not_finite_are_refused_and_the_next_good_frame_is_right(
     mesh, volume, plane = box((5, 4, 5)), around_the_box(), random_plane(np.random.default_rng(2))
     slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra, threads=2)
     nodes = mesh.nodes * [1.0, 1.1, 0.9]
-    before, where = slicer.image(nodes, plane), slicer.rest_coordinates(nodes, plane)
+    before, where = slicer.cut_image(nodes, plane), slicer.compute_rest_coordinates(nodes, plane)
     broken = nodes.copy()
     broken[7, 1] = value
-    for cut in (slicer.image, slicer.labels, slicer.rest_coordinates):
+    for cut in (slicer.cut_image, slicer.cut_labels, slicer.compute_rest_coordinates):
         with pytest.raises(MeshError, match="node 7 is not finite"):
             cut(broken, plane)
         with pytest.raises(MeshError, match=f"4 deformed nodes but {len(nodes)} at rest"):
             cut(nodes[:4], plane)
-    np.testing.assert_array_equal(slicer.image(nodes, plane), before)
-    np.testing.assert_array_equal(slicer.rest_coordinates(nodes, plane), where)
+    np.testing.assert_array_equal(slicer.cut_image(nodes, plane), before)
+    np.testing.assert_array_equal(slicer.compute_rest_coordinates(nodes, plane), where)
     assert slicer.skipped == 0
 
 
@@ -310,12 +315,12 @@ def test_nodes_out_of_all_proportion_do_no_harm(method):
     """A solver that has blown up, but not to infinity: no crash, and the next frame is right."""
     mesh, volume, plane = box((5, 4, 5)), around_the_box(), random_plane(np.random.default_rng(4))
     slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra)
-    before = slicer.image(mesh.nodes, plane)
+    before = slicer.cut_image(mesh.nodes, plane)
     for scale in (1e6, 1e30, 1e150):
         nodes = mesh.nodes.copy()
         nodes[::3] *= scale
-        assert slicer.image(nodes, plane).shape == before.shape
-    np.testing.assert_array_equal(slicer.image(mesh.nodes, plane), before)
+        assert slicer.cut_image(nodes, plane).shape == before.shape
+    np.testing.assert_array_equal(slicer.cut_image(mesh.nodes, plane), before)
 
 
 # --- volumes of any size --------------------------------------------------------------------------
@@ -334,14 +339,14 @@ def test_a_volume_of_one_voxel_is_held_up_to_its_faces(method, shape):
         matrix, shift = random_affine(rng)
         plane = random_plane(rng)
         nodes = mesh.nodes @ matrix.T + shift
-        rest = slicer.rest_coordinates(nodes, plane)
+        rest = slicer.compute_rest_coordinates(nodes, plane)
         index = rest @ volume.patient_to_index[:3, :3].T + volume.patient_to_index[:3, 3]
         last = np.array(shape) - 1
         beyond = np.maximum(-0.5 - index, index - last - 0.5).max(axis=-1)
         inside = beyond < 0
         held = np.clip(np.nan_to_num(index), 0, last)
         grey = map_coordinates(volume.intensities.astype(float), np.moveaxis(held, -1, 0), order=1)
-        image, labels = slicer.image(nodes, plane), slicer.labels(nodes, plane)
+        image, labels = slicer.cut_image(nodes, plane), slicer.cut_labels(nodes, plane)
         clear = ~(np.abs(beyond) < 1e-3)
         assert inside.sum() > 50
         assert np.abs(image - np.floor(grey * inside + 0.5))[clear].max() <= 1

@@ -35,7 +35,7 @@ def ramp():
 def test_only_spans_are_shown():
     spans = np.array([[[0, 2], [5, 8]], [[3, 3], [0, 0]]], dtype=np.int32)
     plane = millimetres(8, 2, spans=spans)
-    image = PerPixel(ramp(), CORNER, ONE).image(CORNER, plane)
+    image = PerPixel(ramp(), CORNER, ONE).cut_image(CORNER, plane)
     np.testing.assert_array_equal(image, [[100, 110, 0, 0, 0, 150, 160, 170], [0] * 8])
 
 
@@ -46,9 +46,9 @@ def test_only_spans_are_shown():
 def test_every_pixel_is_where_linear_algebra_puts_it(kind, seed):
     case = random_case(kind, seed)
     slicer = PerPixel(case.volume, case.rest_nodes, case.tetrahedra, threads=2)
-    rest = slicer.rest_coordinates(case.nodes, case.plane).reshape(-1, 3)
-    points = case.plane.pixels().reshape(-1, 3)
-    shown = case.plane.is_shown().ravel()
+    rest = slicer.compute_rest_coordinates(case.nodes, case.plane).reshape(-1, 3)
+    points = case.plane.compute_pixel_positions().reshape(-1, 3)
+    shown = case.plane.make_shown_mask().ravel()
     holders, places = tetrahedra_at(case, points, 1e-9)
     was_tissue = tetrahedra_at(case._replace(nodes=case.rest_nodes), points, 1e-9)[0].any(axis=1)
     is_tissue = holders.any(axis=1)
@@ -62,8 +62,8 @@ def test_every_pixel_is_where_linear_algebra_puts_it(kind, seed):
     index = rest @ case.volume.patient_to_index[:3, :3].T + case.volume.patient_to_index[:3, 3]
     somewhere = ~np.isnan(rest[:, 0])
     grey, label = sampled(case.volume, index[somewhere])
-    image = slicer.image(case.nodes, case.plane).ravel()
-    labels = slicer.labels(case.nodes, case.plane).ravel()
+    image = slicer.cut_image(case.nodes, case.plane).ravel()
+    labels = slicer.cut_labels(case.nodes, case.plane).ravel()
     assert np.abs(image[somewhere] - grey).max(initial=0) <= 1
     clear = ~between_voxels(index[somewhere])
     np.testing.assert_array_equal(labels[somewhere][clear], label[clear])
@@ -88,19 +88,19 @@ def test_scan_conversion_equals_the_location_of_every_pixel(kind, seed, threads)
     _, _, nodes, plane, volume = case
     oracle = create_slicer("per_pixel", volume, *case[:2])
     slicer = create_slicer("scan_conversion", volume, *case[:2], threads=threads)
-    expected, found = (s.rest_coordinates(nodes, plane) for s in (oracle, slicer))
+    expected, found = (s.compute_rest_coordinates(nodes, plane) for s in (oracle, slicer))
     np.testing.assert_array_equal(np.isnan(found), np.isnan(expected), "coverage")
     assert slicer.skipped == oracle.skipped
 
     linear, shift = volume.patient_to_index[:3, :3], volume.patient_to_index[:3, 3]
     index, place = (rest @ linear.T + shift for rest in (found, expected))
     off = np.linalg.norm(index - place, axis=-1)
-    image, labels = slicer.image(nodes, plane), slicer.labels(nodes, plane)
-    differs = np.abs(image.astype(int) - oracle.image(nodes, plane)) > 1
-    differs |= (labels != oracle.labels(nodes, plane)) & ~between_voxels(place)
+    image, labels = slicer.cut_image(nodes, plane), slicer.cut_labels(nodes, plane)
+    differs = np.abs(image.astype(int) - oracle.cut_image(nodes, plane)) > 1
+    differs |= (labels != oracle.cut_labels(nodes, plane)) & ~between_voxels(place)
     suspect = differs | (off > _CLOSE)
     if suspect.any():
-        holders, places = tetrahedra_at(case, plane.pixels()[suspect])
+        holders, places = tetrahedra_at(case, plane.compute_pixel_positions()[suspect])
         index_there = places @ linear.T + shift
         near = np.linalg.norm(index_there - index[suspect][:, None], axis=-1) <= _CLOSE
         grey, label = sampled(volume, index_there)

@@ -30,9 +30,9 @@ def test_oblique_planes_equal_scipy(seed):
     turn = Pose(rng.uniform(-0.01, 0.01, 3), rng.normal(size=4))
     volume = Volume(noise((40, 30, 50), seed), turn.matrix @ np.diag([1e-3, 5e-4, 8e-4, 1.0]))
     middle = (volume.index_to_patient @ [20, 15, 25, 1])[:3]
-    plane = LinearProbe(0.04, 0.04, 61, 47).plane(Pose(middle, rng.normal(size=4)))
+    plane = LinearProbe(0.04, 0.04, 61, 47).make_plane(Pose(middle, rng.normal(size=4)))
     to_index = volume.patient_to_index
-    index = plane.pixels() @ to_index[:3, :3].T + to_index[:3, 3]
+    index = plane.compute_pixel_positions() @ to_index[:3, :3].T + to_index[:3, 3]
     inside = ((index >= 0) & (index <= np.array(volume.shape) - 1)).all(axis=-1)
     expected = map_coordinates(
         volume.intensities.astype(float), np.moveaxis(index, -1, 0), order=1, mode="nearest"

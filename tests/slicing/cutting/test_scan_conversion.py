@@ -54,7 +54,7 @@ def test_within_the_mesh_every_pixel_is_written_exactly_once(seed):
     nodes = mesh.nodes + rng.uniform(-0.2, 0.2, mesh.nodes.shape) * spacing
     slicer = ScanConversion(volume_around_the_box(), mesh.nodes, mesh.tetrahedra)
     pose = Pose([0.0, 0.0, 0.015], rng.normal(size=4))
-    plane = LinearProbe(0.01, 0.01, 113, 97).plane(pose)
+    plane = LinearProbe(0.01, 0.01, 113, 97).make_plane(pose)
     assert (times_written(slicer, nodes, plane) == 1).all()
 
 
@@ -74,13 +74,13 @@ def test_on_nodes_edges_and_faces_nothing_is_written_twice(axis, layer, off):
     # Left and upper borders belong to the half-open polygons, right and lower ones to outlines.
     if 0 < layer < 3:
         assert (written[:-1, :-1] == 1).all()
-    found = slicer.rest_coordinates(1.0 * mesh.nodes, plane)
-    np.testing.assert_allclose(found, plane.pixels(), rtol=0, atol=1e-9)
+    found = slicer.compute_rest_coordinates(1.0 * mesh.nodes, plane)
+    np.testing.assert_allclose(found, plane.compute_pixel_positions(), rtol=0, atol=1e-9)
 
 
 def test_a_fan_shows_what_the_full_image_shows_within_its_spans():
     mesh = box(COUNTS)
-    full = LinearProbe(0.05, 0.04, 64, 50).plane(Pose([0.004, 0, 0.003], [0.1, 0.05, 0, 1]))
+    full = LinearProbe(0.05, 0.04, 64, 50).make_plane(Pose([0.004, 0, 0.003], [0.1, 0.05, 0, 1]))
     rng = np.random.default_rng(1)
     edges = np.sort(rng.integers(0, 65, (50, 4)), axis=1).reshape(50, 2, 2).astype(np.int32)
     edges[3] = edges[7, 1] = 0
@@ -88,17 +88,19 @@ def test_a_fan_shows_what_the_full_image_shows_within_its_spans():
     volume = volume_around_the_box()
     slicer = ScanConversion(volume, mesh.nodes, mesh.tetrahedra)
     nodes = mesh.nodes * [0.8, 1.0, 0.9]
-    shown = fan.is_shown()
+    shown = fan.make_shown_mask()
     for draw in (
-        lambda plane: slicer.image(nodes, plane),
-        lambda plane: slicer.labels(nodes, plane),
+        lambda plane: slicer.cut_image(nodes, plane),
+        lambda plane: slicer.cut_labels(nodes, plane),
         lambda plane: sample_plane(volume, plane, threads=2),
         lambda plane: sample_labels(volume, plane, threads=3),
     ):
         np.testing.assert_array_equal(draw(fan), np.where(shown, draw(full), 0))
-    places = slicer.rest_coordinates(nodes, fan)
+    places = slicer.compute_rest_coordinates(nodes, fan)
     assert np.isnan(places[~shown]).all()
-    np.testing.assert_array_equal(places[shown], slicer.rest_coordinates(nodes, full)[shown])
+    np.testing.assert_array_equal(
+        places[shown], slicer.compute_rest_coordinates(nodes, full)[shown]
+    )
 
 
 def test_grey_values_keep_within_a_level_along_the_longest_row():
@@ -110,14 +112,14 @@ def test_grey_values_keep_within_a_level_along_the_longest_row():
     plane = SlicePlane([0.0015, 0.002, 0.0022], [1.4e-5, 9e-6, 1.2e-5], [1e-5, -3e-7, 1e-6],
                        columns=4096, rows=3)  # fmt: skip
     slicer = ScanConversion(volume, mesh.nodes, mesh.tetrahedra)
-    index = plane.pixels() * 1e3
+    index = plane.compute_pixel_positions() * 1e3
     expected = np.zeros(index.shape[:2])
     lower = np.floor(index).astype(int)
     way = index - lower
     for side in np.ndindex(2, 2, 2):
         weight = np.where(side, way, 1 - way).prod(axis=-1)
         expected += weight * voxels[tuple(np.moveaxis(lower + side, -1, 0))]
-    found = slicer.image(mesh.nodes, plane)
+    found = slicer.cut_image(mesh.nodes, plane)
     assert np.abs(found - expected).max() < 0.5 + 0.2
 
 
@@ -136,8 +138,8 @@ def test_nothing_is_left_to_compile_after_warming_up():
     assert min(before) >= 1
     mesh = box(COUNTS)
     slicer = ScanConversion(volume_around_the_box(), mesh.nodes, mesh.tetrahedra, threads=2)
-    plane = LinearProbe(0.08, 0.04, 30, 20).plane(Pose([0, 0, -1e-3]))
-    slicer.image(mesh.nodes * 1.1, plane)
-    slicer.labels(mesh.nodes, plane)
-    slicer.rest_coordinates(mesh.nodes, plane)
+    plane = LinearProbe(0.08, 0.04, 30, 20).make_plane(Pose([0, 0, -1e-3]))
+    slicer.cut_image(mesh.nodes * 1.1, plane)
+    slicer.cut_labels(mesh.nodes, plane)
+    slicer.compute_rest_coordinates(mesh.nodes, plane)
     assert [len(kernel.signatures) for kernel in kernels] == before

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.drawing.annotation import Annotation, Badge
-from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
+from us_sim.slicing.drawing.label_outlines import snap_to_border, trace_label_outlines
 from us_sim.slicing.drawing.overlay import ColourBar, ColourScale, Overlay
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
@@ -48,7 +48,7 @@ def disk(labels, column, row, radius, number):
 @PROBES
 @pytest.mark.parametrize(("inset", "apart_mm"), [(2, {1, 5, 10}), (-1, {5, 10, 20})])
 def test_ticks_of_the_depth_scale_stand_at_whole_steps_below_the_face(probe, inset, apart_mm):
-    picture = Annotation(probe, {}).draw(black(probe))
+    picture = Annotation(probe, {}).draw_annotated(black(probe))
     text = round(min(probe.rows, probe.columns) / 40)  # labelled ticks are as long as letters
     rows = runs(picture[:, probe.columns - (text if inset < 0 else inset)].min(axis=-1) > 150)
     ends = (rows == 0) | (rows == probe.rows - 1)
@@ -65,7 +65,7 @@ def test_ticks_of_the_depth_scale_stand_at_whole_steps_below_the_face(probe, ins
 
 @PROBES
 def test_the_focus_is_marked_at_its_depth(probe):
-    picture = Annotation(probe, {}).draw(black(probe)).astype(int)
+    picture = Annotation(probe, {}).draw_annotated(black(probe)).astype(int)
     yellow = (picture[:, :, 0] > 200) & (picture[:, :, 2] < 120)
     rows = np.nonzero(yellow)[0]
     assert len(rows) > 10
@@ -76,7 +76,7 @@ def test_the_focus_is_marked_at_its_depth(probe):
 @pytest.mark.parametrize("radius", [6.0, 25.3, 140.7])
 def test_the_outline_of_a_disk_is_its_circle(radius):
     labels = disk(np.zeros((400, 420), np.uint8), 200.3, 190.6, radius, 7)
-    (outline,) = label_outlines(labels, 7, smoothing=3.0)
+    (outline,) = trace_label_outlines(labels, 7, smoothing=3.0)
     distance = np.hypot(*(outline - [200.3, 190.6]).T)
     assert distance.mean() == pytest.approx(radius, abs=0.15)
     assert np.abs(distance - radius).max() < 0.5
@@ -86,10 +86,10 @@ def test_holes_are_outlined_and_specks_are_not():
     labels = disk(np.zeros((200, 200), np.uint8), 100, 100, 60, 3)
     labels = disk(labels, 100, 100, 30, 9)
     labels[5, 5] = 3
-    outer, inner = label_outlines(labels, 3)
+    outer, inner = trace_label_outlines(labels, 3)
     assert np.hypot(*(outer - 100).T).mean() == pytest.approx(60, abs=0.3)
     assert np.hypot(*(inner - 100).T).mean() == pytest.approx(30, abs=0.3)
-    assert label_outlines(labels, 4) == []
+    assert trace_label_outlines(labels, 4) == []
 
 
 def test_each_structure_is_outlined_in_its_colour_and_named_once():
@@ -97,7 +97,7 @@ def test_each_structure_is_outlined_in_its_colour_and_named_once():
         LINEAR, {6: ("vein", (0.25, 0.4, 0.85)), 5: ("artery", (0.85, 0.15, 0.15))}
     )
     labels = disk(disk(black(LINEAR), 120, 200, 40, 6), 300, 200, 20, 6)
-    blue_once = annotation.draw(black(LINEAR), labels).astype(int)
+    blue_once = annotation.draw_annotated(black(LINEAR), labels).astype(int)
     blue = blue_once[:, :, 2] - blue_once[:, :, 0] > 60
     row, column = np.nonzero(blue)
     first, second = np.hypot(column - 120, row - 200), np.hypot(column - 300, row - 200)
@@ -108,7 +108,7 @@ def test_each_structure_is_outlined_in_its_colour_and_named_once():
     assert np.ptp(column[name]) < 60  # in one place
     assert np.ptp(row[name]) < 20
     labels = disk(labels, 200, 350, 30, 5)
-    both = annotation.draw(black(LINEAR), labels).astype(int)
+    both = annotation.draw_annotated(black(LINEAR), labels).astype(int)
     red = both[:, :, 0] - both[:, :, 2] > 60
     row, column = np.nonzero(red & (np.indices(red.shape)[1] < 420))  # the focus is yellow
     assert (np.abs(np.hypot(column - 200, row - 350) - 30) < 1.6).sum() > 150
@@ -119,8 +119,8 @@ def test_the_badge_stands_in_a_frame_of_its_colour_and_the_image_stays():
     annotation = Annotation(LINEAR, {})
     image = np.random.default_rng(1).integers(0, 256, (512, 512), dtype=np.uint8)
     before = image.copy()
-    live = annotation.draw(image)
-    stale = annotation.draw(image, badge=Badge("STALE 0.6 s", AMBER))
+    live = annotation.draw_annotated(image)
+    stale = annotation.draw_annotated(image, badge=Badge("STALE 0.6 s", AMBER))
     for edge in (stale[:3], stale[-3:], stale[:, :3], stale[:, -3:]):
         assert (edge == AMBER).all()
     text = stale[4:40, 100:412].astype(int)
@@ -146,13 +146,13 @@ def test_a_picture_of_any_size_has_everything_inside(columns, rows, aperture, de
     labels[rows // 3 : rows // 2, columns // 3 :] = 1
     annotation = Annotation(probe, {1: ("artery", (1.0, 0.0, 0.0)), 2: ("bone", (0.0, 1.0, 0.0))})
     badge = Badge(text, AMBER) if text else None
-    picture = annotation.draw(black(probe), labels, badge)
+    picture = annotation.draw_annotated(black(probe), labels, badge)
     assert picture.shape == (rows, columns, 3)
     assert picture.dtype == np.uint8
     if badge:
         assert (picture[0] == AMBER).all()
         assert (picture[:, -1] == AMBER).all()
-    again = annotation.draw(black(probe), labels, badge)
+    again = annotation.draw_annotated(black(probe), labels, badge)
     np.testing.assert_array_equal(picture, again)
 
 
@@ -184,9 +184,9 @@ def test_an_overlay_lies_below_scales_and_names_and_its_outline_is_drawn():
     labels[20:60, 20:60] = 1  # where the bar stands
     annotation = Annotation(PROBE, {1: ("vein", (0.2, 0.3, 0.9))})
     grey = np.full((300, 300), 60, np.uint8)
-    plain = annotation.draw(grey, labels)
+    plain = annotation.draw_annotated(grey, labels)
     overlay = Overlay(values, SCALE, note="12 cm/s", outline=box)
-    picture = annotation.draw(grey, labels, overlay=overlay)
+    picture = annotation.draw_annotated(grey, labels, overlay=overlay)
     assert picture[200, 150].tolist() == [158, 30, 30]
     assert picture[150, 150].min() > 150  # the outline
     np.testing.assert_array_equal(picture[:, -12:], plain[:, -12:])  # the scale of depth
@@ -204,8 +204,8 @@ def test_flipped_all_but_what_is_written_has_left_and_right_exchanged():
     drawn = [np.array([[150.0, 20], [240, 140]])]
     overlay = Overlay(values, SCALE, outline=outline)
     structures = {1: ("vein", (0.2, 0.3, 0.9))}
-    plain = Annotation(PROBE, structures).draw(grey, labels, overlay=overlay, lines=drawn)
-    flipped = Annotation(PROBE, structures, is_flipped=True).draw(
+    plain = Annotation(PROBE, structures).draw_annotated(grey, labels, overlay=overlay, lines=drawn)
+    flipped = Annotation(PROBE, structures, is_flipped=True).draw_annotated(
         grey, labels, overlay=overlay, lines=drawn
     )
     middle = slice(40, 260)  # without the scales
@@ -236,12 +236,12 @@ def volume():
 @pytest.mark.parametrize("flat", [1.0, 0.4, 0.12])
 def test_an_outline_has_no_steps_and_its_area_whatever_the_press(volume, flat):
     scanner = BMode(volume, BORDER_PROBE)
-    scanner.carry(MESH.nodes, MESH.tetrahedra)
+    scanner.attach_mesh(MESH.nodes, MESH.tetrahedra)
     pressed = MESH.nodes * [1.0, 1.0, flat]
-    frame = scanner.frame(Pose([0.015, 0.0014, 0.0]), pressed)
-    refine = partial(onto_border, frame)
-    (plain,) = label_outlines(frame.labels, 1, smoothing=5.0)
-    (outline,) = label_outlines(frame.labels, 1, smoothing=5.0, refine=refine)
+    frame = scanner.make_frame(Pose([0.015, 0.0014, 0.0]), pressed)
+    refine = partial(snap_to_border, frame)
+    (plain,) = trace_label_outlines(frame.labels, 1, smoothing=5.0)
+    (outline,) = trace_label_outlines(frame.labels, 1, smoothing=5.0, refine=refine)
 
     def off(points):
         """mm, root mean square from the ellipse that the circle has become."""

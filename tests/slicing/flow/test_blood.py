@@ -9,7 +9,7 @@ from tubes import ARTERY, RADIUS, SIDES, VEIN, block, tube_vessel, tube_volume
 from us_sim.errors import SceneError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.flow.blood import Blood, Window
+from us_sim.slicing.flow.blood import Blood, PixelWindow
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
 
 PROBE = LinearProbe(aperture=0.018, depth=0.025, columns=180, rows=250)
@@ -24,7 +24,7 @@ def volume():
 @pytest.fixture(scope="module")
 def scanner(volume):
     made = BMode(volume, PROBE)
-    made.carry(block().nodes, block().tetrahedra)
+    made.attach_mesh(block().nodes, block().tetrahedra)
     return made
 
 
@@ -48,7 +48,7 @@ def tilted(degrees, y=0.0):
 
 def beams(probe=PROBE):
     """All pixels, seen along beams that are not steered."""
-    return Window(probe, np.zeros((probe.rows, probe.columns)))
+    return PixelWindow(probe, np.zeros((probe.rows, probe.columns)))
 
 
 def flow_through(frame, velocity, along):
@@ -66,7 +66,7 @@ def test_the_rate_through_a_plane_is_that_of_poiseuille(scanner, artery, degrees
     nodes = block().nodes * [1.0, 1.0, squeezed] + [0.0, 0.0, 0.5 * SIDES[2] * (1 - squeezed)]
     for time in (0.0, 0.2):  # at rest, and at another moment of the pulse
         frame = scanner.frame(tilted(degrees), nodes, time=time)
-        velocity = blood.velocity(frame, beams())
+        velocity = blood.compute_velocity(frame, beams())
         rate = flow_through(frame, velocity, np.array([0.0, 1.0, 0.0]))
         expected = artery.flow * float(artery.pulse(time))
         assert rate == pytest.approx(expected, rel=0.03)
@@ -78,12 +78,12 @@ def test_the_angle_between_beam_and_vessel_counts_by_its_cosine(scanner, artery)
     blood, seen = Blood([artery]), {}
     for degrees in (5, 15, 30, 45, 60):
         frame = scanner.frame(tilted(degrees), block().nodes, time=0.0)
-        velocity, _ = blood.mean_velocities(frame, beams())
+        velocity, _ = blood.compute_mean_velocities(frame, beams())
         seen[degrees] = np.nanmax(np.abs(velocity))
     axis = {degrees: peak / np.sin(np.radians(degrees)) for degrees, peak in seen.items()}
     assert list(axis.values()) == pytest.approx([2 * ARTERY.mean_velocity] * 5, rel=0.02)
     upright = scanner.frame(tilted(0), block().nodes, time=0.0)
-    across, _ = blood.mean_velocities(upright, beams())
+    across, _ = blood.compute_mean_velocities(upright, beams())
     assert np.nanmax(np.abs(across)) < 0.02 * 2 * ARTERY.mean_velocity
 
 
@@ -96,7 +96,7 @@ def test_what_flows_in_at_a_narrowing_flows_out(scanner, artery, squeeze, width,
     nodes[:, 2] = 0.5 * SIDES[2] + (nodes[:, 2] - 0.5 * SIDES[2]) * factor
     blood = Blood([artery])
     frame = scanner.frame(tilted(15, y), nodes, time=0.0)
-    velocity, _ = blood.mean_velocities(frame, beams())
+    velocity, _ = blood.compute_mean_velocities(frame, beams())
     rate = flow_through(frame, velocity, np.array([0.0, 1.0, 0.0]))
     assert rate == pytest.approx(artery.flow, rel=0.05)
 
@@ -105,14 +105,14 @@ def test_a_vein_under_a_full_press_shows_none_and_surges_when_it_is_let_go(scann
     blood = Blood([vein])
     pressed = block().nodes.copy()
     pressed[:, 2] = 0.5 * SIDES[2] + 0.2 * (pressed[:, 2] - 0.5 * SIDES[2])
-    blood.at(scanner.frame(tilted(30), block().nodes, time=0.0))
+    blood.advance_to_frame(scanner.frame(tilted(30), block().nodes, time=0.0))
     at_rest = vein.flow
     for time in (1.0, 5.0, 20.0):
         frame = scanner.frame(tilted(30), pressed, time=time)
-        velocity = blood.velocity(frame, beams())
+        velocity = blood.compute_velocity(frame, beams())
         assert np.nanmax(np.abs(velocity)) == 0.0
     frame = scanner.frame(tilted(30), block().nodes, time=20.1)
-    assert np.nanmax(np.abs(blood.velocity(frame, beams()))) > 0.0
+    assert np.nanmax(np.abs(blood.compute_velocity(frame, beams()))) > 0.0
     assert vein.flow > 2.5 * at_rest
 
 
@@ -125,13 +125,13 @@ def test_a_vein_under_a_full_press_shows_none_and_surges_when_it_is_let_go(scann
 )
 def test_beams_that_spread_see_what_flows_along_them(volume, artery, probe):
     """With the tube in the image, across its middle: the sine of each beam's angle."""
-    from us_sim.slicing.probe.beams import beam_angles, fractions_and_depths
+    from us_sim.slicing.probe.beams import compute_beam_angles, compute_beam_coordinates
 
     turned = Pose([0.0, 0.0, 0.0], [0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4)])
-    frame = BMode(volume, probe).frame(turned, None, time=0.0)
-    angles = beam_angles(probe, fractions_and_depths(probe)[0])
-    velocity, _ = Blood([artery]).mean_velocities(frame, Window(probe, angles))
-    places = frame.plane.pixels()
+    frame = BMode(volume, probe).make_frame(turned, None, time=0.0)
+    angles = compute_beam_angles(probe, compute_beam_coordinates(probe)[0])
+    velocity, _ = Blood([artery]).compute_mean_velocities(frame, PixelWindow(probe, angles))
+    places = frame.plane.compute_pixel_positions()
     x, z = places[..., 1], places[..., 2]  # lateral is along the tube
     behind = probe.radius if isinstance(probe, ConvexProbe) else 0.0
     expected = -0.2 * (1 - ((z - 0.01) / RADIUS) ** 2) * x / np.hypot(x, z + behind)

@@ -12,7 +12,7 @@ from tubes import ARTERY, SIDES, block, tube_vessel, tube_volume
 from us_sim.errors import ProbeError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.flow.blood import Absence, Blood
+from us_sim.slicing.flow.blood import Blood, FlowAbsence
 from us_sim.slicing.flow.doppler import ColourDoppler, Spectrum
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
 from us_sim.slicing.settings import ColourSettings, Imaging, SpectrumSettings
@@ -29,7 +29,7 @@ SYSTOLE = 0.13 / 1.1
 @pytest.fixture(scope="module")
 def scanner():
     made = BMode(tube_volume(), PROBE)
-    made.carry(block().nodes, block().tetrahedra)
+    made.attach_mesh(block().nodes, block().tetrahedra)
     return made
 
 
@@ -57,7 +57,10 @@ def test_velocities_turn_over_at_the_nyquist_velocity(scanner, blood, nyquist):
     settings = dataclasses.replace(WIDE, nyquist_velocity=nyquist, pulses=64)
     doppler = ColourDoppler(PROBE, settings)
     frame = frame_at(scanner, SYSTOLE)
-    truth, estimate = doppler.truth(blood, frame), doppler.estimate(blood, frame)
+    truth, estimate = (
+        doppler.compute_true_velocity(blood, frame),
+        doppler.estimate_velocity(blood, frame),
+    )
     shown = ~np.isnan(estimate) & ~np.isnan(truth)
     assert np.count_nonzero(shown) > 0.95 * np.count_nonzero(~np.isnan(truth))
     assert np.nanmax(np.abs(truth)) == pytest.approx(0.4, rel=0.03)  # 0.8 m/s at 60 degrees
@@ -76,7 +79,10 @@ def test_noise_falls_with_the_root_of_the_number_of_pulses(scanner, blood):
         errors = []
         for beat in range(20):
             frame = frame_at(scanner, SYSTOLE + beat / 1.1)
-            errors.append(doppler.estimate(blood, frame) - doppler.truth(blood, frame))
+            errors.append(
+                doppler.estimate_velocity(blood, frame)
+                - doppler.compute_true_velocity(blood, frame)
+            )
         spread[pulses] = np.nanstd(errors)
     assert spread[4] / spread[16] == pytest.approx(2.0, rel=0.1)
     assert spread[16] / spread[64] == pytest.approx(2.0, rel=0.1)
@@ -84,9 +90,9 @@ def test_noise_falls_with_the_root_of_the_number_of_pulses(scanner, blood):
 
 def test_the_wall_filter_takes_what_is_slow(scanner, blood):
     frame = frame_at(scanner, SYSTOLE)
-    truth = ColourDoppler(PROBE, WIDE).truth(blood, frame)
+    truth = ColourDoppler(PROBE, WIDE).compute_true_velocity(blood, frame)
     settings = dataclasses.replace(WIDE, nyquist_velocity=1.0, wall_filter=0.15, pulses=64)
-    estimate = ColourDoppler(PROBE, settings).estimate(blood, frame)
+    estimate = ColourDoppler(PROBE, settings).estimate_velocity(blood, frame)
     inside = ~np.isnan(truth)
     assert np.isnan(estimate[inside & (np.abs(truth) < 0.07)]).all()
     assert not np.isnan(estimate[inside & (np.abs(truth) > 0.2)]).any()
@@ -95,40 +101,42 @@ def test_the_wall_filter_takes_what_is_slow(scanner, blood):
 @pytest.mark.parametrize(
     ("why", "fan", "given"),
     [
-        (Absence.NOTHING, TILT, {}),
-        (Absence.NO_CONTACT, TILT, {}),
-        (Absence.NO_VESSEL, TILT, {"width": 0.1, "lateral": 0.4}),
-        (Absence.NO_FLOW, TILT, {}),
-        (Absence.ACROSS_FLOW, np.radians(1), {"wall_filter": 0.05}),
-        (Absence.TOO_SLOW, np.radians(8), {"wall_filter": 0.2, "nyquist_velocity": 0.6}),
+        (FlowAbsence.NOTHING, TILT, {}),
+        (FlowAbsence.NO_CONTACT, TILT, {}),
+        (FlowAbsence.NO_VESSEL, TILT, {"width": 0.1, "lateral": 0.4}),
+        (FlowAbsence.NO_FLOW, TILT, {}),
+        (FlowAbsence.ACROSS_FLOW, np.radians(1), {"wall_filter": 0.05}),
+        (FlowAbsence.TOO_SLOW, np.radians(8), {"wall_filter": 0.2, "nyquist_velocity": 0.6}),
     ],
 )
 def test_why_no_colour_is_shown_is_told(scanner, why, fan, given):
     pose = Pose([0.0, 0.0, 0.0], [np.sin(fan / 2), 0.0, 0.0, np.cos(fan / 2)])
     frame = scanner.frame(pose, block().nodes, time=SYSTOLE)
-    blood = Blood([tube_vessel(ARTERY)]).at(frame)
-    air = why is Absence.NO_CONTACT
+    blood = Blood([tube_vessel(ARTERY)]).advance_to_frame(frame)
+    air = why is FlowAbsence.NO_CONTACT
     frame.contact = np.full(PROBE.lines, 0.0 if air else 1.0), np.zeros(PROBE.lines)
-    if why is Absence.NO_FLOW:
+    if why is FlowAbsence.NO_FLOW:
         blood.vessels[0].axis_velocity[:] = 0.0
     doppler = ColourDoppler(PROBE, dataclasses.replace(WIDE, **given))
-    shown = doppler.estimate(blood, frame)
-    assert np.isfinite(shown).any() == (why is Absence.NOTHING)
-    assert doppler.absence(blood, frame, shown) is why
+    shown = doppler.estimate_velocity(blood, frame)
+    assert np.isfinite(shown).any() == (why is FlowAbsence.NOTHING)
+    assert doppler.explain_absence(blood, frame, shown) is why
 
 
 def test_persistence_keeps_what_was_and_forgets_it_after_a_pause(scanner):
     settings = dataclasses.replace(WIDE, persistence=0.9, pulses=64)
     doppler, blood = ColourDoppler(PROBE, settings), Blood([tube_vessel(ARTERY)])
-    first = doppler.estimate(blood, frame_at(scanner, SYSTOLE))
+    first = doppler.estimate_velocity(blood, frame_at(scanner, SYSTOLE))
     slow = SYSTOLE + 0.3
-    kept = doppler.estimate(blood, frame_at(scanner, slow))
-    fresh = ColourDoppler(PROBE, settings).estimate(blood, frame_at(scanner, slow))
+    kept = doppler.estimate_velocity(blood, frame_at(scanner, slow))
+    fresh = ColourDoppler(PROBE, settings).estimate_velocity(blood, frame_at(scanner, slow))
     shown = ~np.isnan(first) & ~np.isnan(kept) & ~np.isnan(fresh)
     nearer = np.abs(kept - first)[shown] < np.abs(kept - fresh)[shown]
     assert nearer.mean() > 0.9
-    late = doppler.estimate(blood, frame_at(scanner, slow + 10 / 1.1))
-    again = ColourDoppler(PROBE, settings).estimate(blood, frame_at(scanner, slow + 10 / 1.1))
+    late = doppler.estimate_velocity(blood, frame_at(scanner, slow + 10 / 1.1))
+    again = ColourDoppler(PROBE, settings).estimate_velocity(
+        blood, frame_at(scanner, slow + 10 / 1.1)
+    )
     assert np.array_equal(late, again, equal_nan=True)
 
 
@@ -152,7 +160,7 @@ def test_colour_is_shown_within_its_box_only(lateral, width, depth, height, stee
     )
     doppler = ColourDoppler(PROBE, asked)
     scanner, blood = BMode(SMALL.volume, PROBE), SMALL.blood
-    shown = ~np.isnan(doppler.estimate(blood, scanner.frame(POSE, None, time=1.0)))
+    shown = ~np.isnan(doppler.estimate_velocity(blood, scanner.make_frame(POSE, None, time=1.0)))
     matrix = PROBE.image_to_probe
     x = matrix[0, 3] + matrix[0, 0] * np.arange(PROBE.columns)
     z = matrix[2, 3] + matrix[2, 1] * np.arange(PROBE.rows)[:, None]
@@ -183,7 +191,7 @@ def test_steered_beams_see_a_vessel_in_the_image_by_the_angle(scanner):
     blood = Blood([tube_vessel(ARTERY)])
     for steering in (0.0, 0.2, 0.4):
         doppler = ColourDoppler(PROBE, dataclasses.replace(WIDE, steering=steering))
-        fastest = np.nanmax(np.abs(doppler.truth(blood, frame)))
+        fastest = np.nanmax(np.abs(doppler.compute_true_velocity(blood, frame)))
         assert fastest == pytest.approx(0.8 * np.sin(steering), rel=0.03, abs=0.02)
 
 
@@ -216,7 +224,9 @@ def test_beams_whose_face_is_in_the_air_show_nothing():
     lifted = Pose([0.0, 0.0, -1e-3], [0.0, np.sin(turn), 0.0, np.cos(turn)])
     along = Pose([0.0] * 3, [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
     frames = [
-        BMode(volume, PROBE, Imaging(contact=contact)).frame(along @ lifted, None, time=SYSTOLE)
+        BMode(volume, PROBE, Imaging(contact=contact)).make_frame(
+            along @ lifted, None, time=SYSTOLE
+        )
         for contact in (True, False)
     ]
     coupling, _ = frames[0].contact
@@ -224,7 +234,8 @@ def test_beams_whose_face_is_in_the_air_show_nothing():
     assert frames[1].contact is None
     settings_ = dataclasses.replace(WIDE, nyquist_velocity=1.0)
     coupled, free = (
-        ~np.isnan(ColourDoppler(PROBE, settings_).estimate(blood, frame)) for frame in frames
+        ~np.isnan(ColourDoppler(PROBE, settings_).estimate_velocity(blood, frame))
+        for frame in frames
     )
     dead = coupling[np.linspace(0, PROBE.lines - 1, PROBE.columns).round().astype(int)] < 0.1
     assert free[:, dead].any()
@@ -240,7 +251,7 @@ ROWS = 256
 @pytest.fixture(scope="module")
 def gate_scanner():
     made = BMode(tube_volume(), GATE_PROBE)
-    made.carry(block().nodes, block().tetrahedra)
+    made.attach_mesh(block().nodes, block().tetrahedra)
     return made
 
 
@@ -267,9 +278,9 @@ def test_its_middle_follows_the_pulse(gate_scanner, artery):
     blood = Blood([artery])
     frame = gate_scanner.frame(POSE, block().nodes, time=0.0)
     moments = np.arange(100) / 110
-    columns, seen = Spectrum(GATE_PROBE, GATE).columns(blood, frame, moments)
+    columns, seen = Spectrum(GATE_PROBE, GATE).compute_columns(blood, frame, moments)
     found = middles(columns, GATE)
-    blood.at(frame)
+    blood.advance_to_frame(frame)
     sign = -np.sign(POSE.rotation[1, 2])
     axis = 2 * sign * ARTERY.mean_velocity * artery.pulse(moments) * np.sin(TILT)
     assert seen.all()
@@ -285,7 +296,7 @@ def test_no_column_depends_on_when_frames_come(gate_scanner, artery):
     for times in (np.linspace(2.0, 3.0, 3), np.linspace(2.0, 3.0, 41)):
         blood, spectrum = Blood([artery]), Spectrum(GATE_PROBE, GATE)
         for time in times:
-            picture = spectrum.show(blood, gate_scanner.frame(POSE, block().nodes, time=time))
+            picture = spectrum.draw_sweep(blood, gate_scanner.frame(POSE, block().nodes, time=time))
         pictures.append(picture)
     assert np.array_equal(*pictures)
     assert pictures[0].any()
@@ -323,19 +334,19 @@ def strip_of(frame, blood, **given):
     """
     spectrum = Spectrum(GATE_PROBE, dataclasses.replace(GATE, sweep=1.0, **given))
     for frame.time in np.arange(1.0, 2.01, 0.05):
-        picture = spectrum.show(blood, frame)
+        picture = spectrum.draw_sweep(blood, frame)
     return spectrum, np.count_nonzero(picture[:ROWS, :500, 0] > 90) > 100
 
 
 @pytest.mark.parametrize(
     ("why", "fan", "coupling", "given"),
     [
-        (Absence.NOTHING, np.radians(4), 1.0, {}),  # nearly across, and drawn all the same
-        (Absence.NOTHING, TILT, 0.2, {}),
-        (Absence.NO_CONTACT, TILT, 0.0, {}),
-        (Absence.NO_VESSEL, TILT, 1.0, {"lateral": 0.45}),
-        (Absence.ACROSS_FLOW, 0.0, 1.0, {"wall_filter": 0.02}),
-        (Absence.TOO_SLOW, np.radians(8), 1.0, {"wall_filter": 0.2}),
+        (FlowAbsence.NOTHING, np.radians(4), 1.0, {}),  # nearly across, and drawn all the same
+        (FlowAbsence.NOTHING, TILT, 0.2, {}),
+        (FlowAbsence.NO_CONTACT, TILT, 0.0, {}),
+        (FlowAbsence.NO_VESSEL, TILT, 1.0, {"lateral": 0.45}),
+        (FlowAbsence.ACROSS_FLOW, 0.0, 1.0, {"wall_filter": 0.02}),
+        (FlowAbsence.TOO_SLOW, np.radians(8), 1.0, {"wall_filter": 0.2}),
     ],
 )
 def test_why_there_is_no_spectrum_is_told_where_none_is_drawn(
@@ -347,10 +358,10 @@ def test_why_there_is_no_spectrum_is_told_where_none_is_drawn(
     frame.contact = np.full(GATE_PROBE.lines, coupling), np.zeros(GATE_PROBE.lines)
     depth = 0.5 * SIDES[2] / np.cos(fan)
     slow = dataclasses.replace(ARTERY, peak_velocity=0.2, mean_velocity=0.05)
-    blood = Blood([tube_vessel(slow if why is Absence.TOO_SLOW else ARTERY)])
+    blood = Blood([tube_vessel(slow if why is FlowAbsence.TOO_SLOW else ARTERY)])
     spectrum, is_drawn = strip_of(frame, blood, depth=depth, **given)
-    assert is_drawn == (why is Absence.NOTHING)
-    assert spectrum.absence(blood, frame) is why
+    assert is_drawn == (why is FlowAbsence.NOTHING)
+    assert spectrum.explain_absence(blood, frame) is why
 
 
 def test_there_is_a_spectrum_as_long_as_it_is_on_the_strip(gate_scanner, artery):
@@ -358,6 +369,6 @@ def test_there_is_a_spectrum_as_long_as_it_is_on_the_strip(gate_scanner, artery)
     blood = Blood([artery])
     spectrum, _ = strip_of(frame, blood)
     frame.contact = np.zeros(GATE_PROBE.lines), np.zeros(GATE_PROBE.lines)
-    for frame.time, why in ((2.5, Absence.NOTHING), (3.1, Absence.NO_CONTACT)):
-        spectrum.show(blood, frame)
-        assert spectrum.absence(blood, frame) is why
+    for frame.time, why in ((2.5, FlowAbsence.NOTHING), (3.1, FlowAbsence.NO_CONTACT)):
+        spectrum.draw_sweep(blood, frame)
+        assert spectrum.explain_absence(blood, frame) is why

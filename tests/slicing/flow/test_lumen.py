@@ -8,14 +8,14 @@ from hypothesis import strategies as st
 from tubes import RADIUS, SIDES, around, block, grid, tube_volume
 
 from us_sim.errors import VolumeError
-from us_sim.slicing.flow.lumen import centreline, lumen_of
+from us_sim.slicing.flow.lumen import find_centreline, measure_lumen
 from us_sim.slicing.flow.vessel import CarriedLumen
 
 MIDDLE = np.array([0.0, 0.0, 0.5 * SIDES[2]])
 
 
 def lumen_in(volume):
-    return lumen_of(volume.labels == 1, volume.index_to_patient)
+    return measure_lumen(volume.labels == 1, volume.index_to_patient)
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def test_places_are_along_the_tube_and_radial_coordinates_as_in_a_cylinder():
     angle, part = random.uniform(0, 2 * np.pi, 200), random.uniform(0.05, 1.3, 200)
     along = random.uniform(-15e-3, 15e-3, 200)
     points = np.column_stack([3e-3 * part * np.cos(angle), along, 3e-3 * part * np.sin(angle)])
-    station, offset = lumen.locate(points + MIDDLE)
+    station, offset = lumen.locate_points(points + MIDDLE)
     assert np.hypot(*offset.T) == pytest.approx(part, rel=0.06)
     forward = np.sign(lumen.centres[-1, 1] - lumen.centres[0, 1])
     place = lumen.centres[0, 1] + forward * station * lumen.spacing
@@ -55,7 +55,7 @@ def test_what_its_sections_do_not_hold_is_no_tube():
     fin = (np.abs(x - 1e-3) < 0.6e-3) & (z > 0) & (z < 8e-3)
     hook = (x > 0.4e-3) & (x < 7e-3) & (np.abs(z - 8e-3) < 0.6e-3)
     with pytest.raises(VolumeError, match=r"is no tube: |is too short"):
-        lumen_of(tube | fin | hook, to_patient)
+        measure_lumen(tube | fin | hook, to_patient)
 
 
 @st.composite
@@ -78,20 +78,20 @@ def shapes(draw):
 @given(shapes(), st.floats(0.2, 5.0), st.floats(0.2, 5.0))
 def test_any_shape_is_a_tube_or_is_refused(lumen, one, other):
     try:
-        found = lumen_of(lumen, np.diag([1e-3, one * 1e-3, other * 1e-3, 1.0]))
+        found = measure_lumen(lumen, np.diag([1e-3, one * 1e-3, other * 1e-3, 1.0]))
     except VolumeError:
         return
     assert np.isfinite(found.radii).all()
     assert (found.radii > 0.0).all()
     assert len(found.centres) >= 2
-    station, offset = found.locate(found.centres)
+    station, offset = found.locate_points(found.centres)
     assert np.isfinite(station).all()
     assert np.abs(offset).max() < 0.2
 
 
 def refusal(lumen, to_patient=None):
     with pytest.raises(VolumeError) as caught:
-        centreline(lumen, np.eye(4) if to_patient is None else to_patient)
+        find_centreline(lumen, np.eye(4) if to_patient is None else to_patient)
     return str(caught.value)
 
 
@@ -99,7 +99,7 @@ def refusal(lumen, to_patient=None):
 def test_it_lies_in_the_middle_of_a_straight_tube(direction):
     places, to_patient = grid()
     middle = np.array([0.0, 0.0, 0.5 * SIDES[2]])
-    line = centreline(around(places, middle, direction), to_patient)
+    line = find_centreline(around(places, middle, direction), to_patient)
     unit = np.array(direction) / np.linalg.norm(direction)
     offset = line.points - middle
     across = np.linalg.norm(offset - np.outer(offset @ unit, unit), axis=1)
@@ -114,7 +114,7 @@ def test_it_follows_a_bend():
     places, to_patient = grid(sides=(40e-3, 40e-3, 10e-3))
     x, y, z = np.moveaxis(places - [-20e-3, -20e-3, 5e-3], -1, 0)
     lumen = np.hypot(np.hypot(x, y) - 15e-3, z) < 2.5e-3
-    points = centreline(lumen, to_patient).points - [-20e-3, -20e-3, 5e-3]
+    points = find_centreline(lumen, to_patient).points - [-20e-3, -20e-3, 5e-3]
     assert np.abs(np.hypot(points[:, 0], points[:, 1]) - 15e-3).max() < 0.5e-3
     angles = np.arctan2(points[:, 1], points[:, 0])
     assert np.ptp(angles) > np.radians(65)
@@ -136,7 +136,7 @@ def test_shapes_that_are_no_tubes_are_refused_with_the_reason():
 @pytest.fixture(scope="module")
 def tube():
     volume = tube_volume()
-    return lumen_of(volume.labels == 1, volume.index_to_patient)
+    return measure_lumen(volume.labels == 1, volume.index_to_patient)
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +149,7 @@ def carried(tube):
 def test_a_homogeneous_deformation_changes_areas_as_nanson_says(tube, carried, stretch):
     """n' A' = det(F) F^-T n A, of which the flow sees what is along the carried tangent."""
     deformation = np.eye(3) + stretch
-    now = carried.carry(block().nodes @ deformation.T)
+    now = carried.deform_lumen(block().nodes @ deformation.T)
     along = tube.tangents @ deformation.T
     lengths = np.linalg.norm(along, axis=1)
     expected = tube.areas * np.linalg.det(deformation) / lengths
@@ -161,6 +161,6 @@ def test_a_homogeneous_deformation_changes_areas_as_nanson_says(tube, carried, s
 
 def test_a_lumen_that_is_turned_inside_out_is_empty(carried):
     nodes = block().nodes * [1.0, 1.0, -1.0]
-    now = carried.carry(nodes)
+    now = carried.deform_lumen(nodes)
     assert (now.areas == 0.0).all()
     assert (now.filled == 0.0).all()

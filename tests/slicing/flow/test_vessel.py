@@ -18,8 +18,8 @@ VEIN = FlowSettings("venous", (0, 1, 0), 0.2, 0.08, filling_time=5.0)
 def steady(settings, areas):
     """The flow after a long time, over that at rest."""
     circulation = Circulation(settings, REST, SPACING)
-    circulation.advance(0.0, areas)
-    return circulation.advance(1e4, areas) / circulation.at_rest
+    circulation.compute_flow(0.0, areas)
+    return circulation.compute_flow(1e4, areas) / circulation.at_rest
 
 
 def resistance(areas):
@@ -46,16 +46,16 @@ def test_a_vessel_closed_at_one_place_has_no_flow(settings):
 def test_a_closed_vein_fills_up_and_surges_when_it_opens():
     circulation = Circulation(VEIN, REST, SPACING)
     closed = 0.2 * REST
-    circulation.advance(0.0, REST)
+    circulation.compute_flow(0.0, REST)
     for step in range(1, 101):  # 4 s, in which the pressure goes towards that of the bed
-        assert circulation.advance(0.04 * step, closed) == 0.0
+        assert circulation.compute_flow(0.04 * step, closed) == 0.0
     bed, rest = VEIN.bed_pressure, VEIN.pressure_at_rest
     filled = bed - (bed - rest) * np.exp(-4.0 / VEIN.filling_time)
     assert circulation.pressure == pytest.approx(filled)
-    surge = circulation.advance(4.0 + 1e-9, REST)
+    surge = circulation.compute_flow(4.0 + 1e-9, REST)
     assert surge / circulation.at_rest == pytest.approx(filled / rest, rel=1e-6)
     # Open, it empties faster, by the flow that the bed's resistance lets follow.
-    later = circulation.advance(5.0, REST)
+    later = circulation.compute_flow(5.0, REST)
     left = np.exp(-1.0 * (bed / rest) / VEIN.filling_time)
     excess = (surge / circulation.at_rest - 1.0) * left
     assert later / circulation.at_rest == pytest.approx(1.0 + excess, rel=1e-6)
@@ -67,18 +67,18 @@ def test_frames_in_between_change_nothing(steps):
     areas = 0.6 * REST
     often, once = (Circulation(VEIN, REST, SPACING) for _ in range(2))
     for circulation in (often, once):
-        circulation.advance(0.0, 0.1 * REST)
-        circulation.advance(3.0, 0.1 * REST)
+        circulation.compute_flow(0.0, 0.1 * REST)
+        circulation.compute_flow(3.0, 0.1 * REST)
     for time in 3.0 + np.cumsum(steps):
-        flow = often.advance(time, areas)
-    assert flow == pytest.approx(once.advance(3.0 + np.sum(steps), areas), rel=1e-9)
+        flow = often.compute_flow(time, areas)
+    assert flow == pytest.approx(once.compute_flow(3.0 + np.sum(steps), areas), rel=1e-9)
 
 
 def test_where_time_goes_back_it_is_at_rest_again():
     circulation = Circulation(VEIN, REST, SPACING)
-    circulation.advance(0.0, 0.1 * REST)
-    circulation.advance(30.0, 0.1 * REST)
-    assert circulation.advance(1.0, REST) == pytest.approx(circulation.at_rest)
+    circulation.compute_flow(0.0, 0.1 * REST)
+    circulation.compute_flow(30.0, 0.1 * REST)
+    assert circulation.compute_flow(1.0, REST) == pytest.approx(circulation.at_rest)
 
 
 MEANS = st.floats(0.01, 0.3)

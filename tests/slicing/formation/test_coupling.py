@@ -40,7 +40,7 @@ def tilted(degrees, z):
 
 @pytest.mark.parametrize("height", [0.01, 0.0004, 0.0])
 def test_the_gap_is_the_height_above_flat_skin(height):
-    gap, press = SURFACE.gaps(BLOCK.nodes, PROBE, Pose([0.003, 0.0011, -height]))
+    gap, press = SURFACE.measure_gaps(BLOCK.nodes, PROBE, Pose([0.003, 0.0011, -height]))
     np.testing.assert_allclose(gap, height, atol=1e-12)
     np.testing.assert_allclose(press, -height, atol=1e-12)
 
@@ -53,8 +53,8 @@ def test_an_open_skin_is_met_as_the_block_that_it_covers(degrees, away):
     skin = ContactSurface(sheet.vertices + shift, sheet.triangles, is_outward=True)
     pose = tilted(degrees, 0.002)
     moved = Pose(pose.position + shift, pose.orientation)
-    expected = SURFACE.contact(BLOCK.nodes, PROBE, pose)
-    found = skin.contact(sheet.vertices + shift, PROBE, moved)
+    expected = SURFACE.measure_contact(BLOCK.nodes, PROBE, pose)
+    found = skin.measure_contact(sheet.vertices + shift, PROBE, moved)
     np.testing.assert_allclose(found[0], expected[0], atol=1e-5)
     np.testing.assert_allclose(found[1], expected[1], atol=1e-9)
     assert found[0].max() > 0.0
@@ -62,7 +62,7 @@ def test_an_open_skin_is_met_as_the_block_that_it_covers(degrees, away):
 
 def test_coupling_from_air_to_full_contact():
     def coupled(z):
-        line = SURFACE.contact(BLOCK.nodes, PROBE, Pose([0, 0.0011, z]))[0]
+        line = SURFACE.measure_contact(BLOCK.nodes, PROBE, Pose([0, 0.0011, z]))[0]
         assert np.ptp(line) == 0.0
         return float(line[0])
 
@@ -79,13 +79,13 @@ def test_coupling_from_air_to_full_contact():
 def test_a_tilted_probe_is_in_air_exactly_where_it_is_off_the_skin(degrees, z, mirrored):
     degrees = -degrees if mirrored else degrees
     pose = tilted(degrees, z)
-    gap, press = SURFACE.gaps(BLOCK.nodes, PROBE, pose)
+    gap, press = SURFACE.measure_gaps(BLOCK.nodes, PROBE, pose)
     x = PROBE.beam_starts[:, 0]
     angle = np.radians(degrees)
     height = x * np.sin(angle) - z  # of each line's start above the skin
     np.testing.assert_allclose(gap, height / np.cos(angle), atol=1e-9)
     np.testing.assert_allclose(press, -gap, atol=1e-9)
-    coupling = SURFACE.contact(BLOCK.nodes, PROBE, pose)[0]
+    coupling = SURFACE.measure_contact(BLOCK.nodes, PROBE, pose)[0]
     assert (coupling[gap > GEL_FILM[1]] == 0.0).all()
     assert (coupling[gap < 0.0] >= np.float32(LIGHT_CONTACT)).all()
 
@@ -94,20 +94,20 @@ def test_indented_tissue_is_pressed_by_as_much_as_it_moved():
     nodes = BLOCK.nodes.copy()
     nodes[:, 2] += 0.008 * (1 - nodes[:, 2] / 0.05)
     nodes[:, 0] += 0.003  # and dragged aside, which presses nothing
-    gap, press = SURFACE.gaps(nodes, PROBE, Pose([0.003, 0.0011, 0.0078]))
+    gap, press = SURFACE.measure_gaps(nodes, PROBE, Pose([0.003, 0.0011, 0.0078]))
     np.testing.assert_allclose(gap, 0.0002, atol=1e-9)
     np.testing.assert_allclose(press, 0.0078, atol=1e-9)
 
 
 def test_beside_the_tissue_there_is_nothing_to_touch():
-    gap, press = SURFACE.gaps(BLOCK.nodes, PROBE, Pose([0.06, 0.0011, 0.002]))
+    gap, press = SURFACE.measure_gaps(BLOCK.nodes, PROBE, Pose([0.06, 0.0011, 0.002]))
     beside = PROBE.beam_starts[:, 0] + 0.06 > 0.05
     assert np.isinf(gap[beside]).all()
     assert (press[beside] == 0.0).all()
     np.testing.assert_allclose(gap[~beside], -0.002, atol=1e-12)
     turned = Pose([0, 0.0011, -0.01], [1, 0, 0, 0])  # looks away
-    assert np.isinf(SURFACE.gaps(BLOCK.nodes, PROBE, turned)[0]).all()
-    far = SURFACE.contact(BLOCK.nodes, PROBE, Pose([0, 0.5, 0.002]))[0]
+    assert np.isinf(SURFACE.measure_gaps(BLOCK.nodes, PROBE, turned)[0]).all()
+    far = SURFACE.measure_contact(BLOCK.nodes, PROBE, Pose([0, 0.5, 0.002]))[0]
     assert (far == 0.0).all()
 
 
@@ -119,7 +119,7 @@ def test_a_fold_in_the_skin_is_no_air():
         np.concatenate([BLOCK.boundary, BLOCK.boundary + len(BLOCK.nodes)]),
     )
     # The face has entered both and left one again.
-    gap, _ = surface.gaps(surface.rest_nodes, PROBE, Pose([0, 0.0011, 0.002]))
+    gap, _ = surface.measure_gaps(surface.rest_nodes, PROBE, Pose([0, 0.0011, 0.002]))
     assert (gap <= 0.0).all()
 
 
@@ -164,7 +164,7 @@ def test_the_layer_shows_the_tissue_beyond_it_mirrored(name, first, last):
     probe = PROBES[name]
     gap = np.linspace(first, last, probe.lines)
     image, surface = graded(probe, gap)
-    filled = GelLayer(probe).filled(image, gap, np.ones(probe.lines))
+    filled = GelLayer(probe).fill_gap(image, gap, np.ones(probe.lines))
     depth = probe.pixel_beams[1]
     pixel = float(np.hypot(*probe.pixel_spacing))
     layer = depth < surface
@@ -192,8 +192,8 @@ def test_no_black_wedge_where_a_coarse_mesh_stands_off_a_pressed_face():
 
     def shown(contact):
         scanner = BMode(Volume(grey, to_patient), probe, Imaging(contact=contact))
-        scanner.carry(block.nodes, block.tetrahedra)
-        return scanner.image(pressed, nodes)
+        scanner.attach_mesh(block.nodes, block.tetrahedra)
+        return scanner.render_image(pressed, nodes)
 
     assert (shown(False)[:4] == 0).mean() > 0.3  # the wedges are there
     assert (shown(True) == 120).all()
@@ -220,18 +220,18 @@ def coupling(value):
 @pytest.mark.parametrize(("share", "decibels"), [(0.5, 6.02), (0.1, 20.0)])
 def test_a_badly_coupled_line_is_dimmer_by_decibels_at_every_depth(share, decibels):
     expected = np.maximum(TISSUE.astype(int) - round(4.25 * decibels), 0)
-    np.testing.assert_array_equal(quiet().shown(TISSUE, coupling(share)), expected)
+    np.testing.assert_array_equal(quiet().apply_coupling(TISSUE, coupling(share)), expected)
 
 
 def test_air_shows_no_tissue():
-    shown = air().shown(TISSUE, coupling(0.0))
-    np.testing.assert_array_equal(shown, air().shown(np.zeros_like(TISSUE), coupling(0.0)))
-    np.testing.assert_array_equal(shown, air().shown(TISSUE, coupling(0.0)))  # every frame
+    shown = air().apply_coupling(TISSUE, coupling(0.0))
+    np.testing.assert_array_equal(shown, air().apply_coupling(np.zeros_like(TISSUE), coupling(0.0)))
+    np.testing.assert_array_equal(shown, air().apply_coupling(TISSUE, coupling(0.0)))  # every frame
     assert (shown[-100:] == 0).all()
 
 
 def test_bands_are_a_lens_apart_and_each_weaker_by_as_much():
-    mean = air().shown(TISSUE, coupling(0.0)).mean(axis=1)
+    mean = air().apply_coupling(TISSUE, coupling(0.0)).mean(axis=1)
     spacing = 0.04 / 400
     depths = (np.arange(400) + 0.5) * spacing
     bands = [i for i in range(1, 120) if mean[i - 1] < mean[i] >= mean[i + 1]]
@@ -247,7 +247,7 @@ def test_bands_are_a_lens_apart_and_each_weaker_by_as_much():
 def test_a_shadow_is_as_soft_as_the_aperture_is_wide(row, aperture):
     half = (np.arange(100) < 50).astype(np.float32)  # the face's middle is the edge
     strong = np.full_like(TISSUE, 200)
-    shown = quiet().shown(strong, half)[row].astype(int)
+    shown = quiet().apply_coupling(strong, half)[row].astype(int)
     x = (np.arange(200) - 99.5) * 0.2e-3  # m from the edge
     margin = 0.5 * aperture + 0.6e-3  # a step of depth, and a line
     assert (shown[x < -margin] == 200).all()
@@ -261,7 +261,7 @@ def test_a_shadow_is_as_soft_as_the_aperture_is_wide(row, aperture):
 def test_a_fan_stays_black_beside_its_beams_and_its_bands_follow_the_face():
     probe = ConvexProbe(radius=0.05, opening_angle=1.0, depth=0.05, columns=300, rows=300)
     air = Reverberation(probe, Imaging(contact=True))
-    shown = air.shown(np.zeros((300, 300), np.uint8), np.zeros(probe.lines, np.float32))
+    shown = air.apply_coupling(np.zeros((300, 300), np.uint8), np.zeros(probe.lines, np.float32))
     line, way = probe.pixel_beams
     assert (shown[np.isnan(line)] == 0).all()
     bright = shown > 180

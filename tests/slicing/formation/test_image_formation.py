@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from us_sim.geometry.pose import Pose
-from us_sim.slicing.formation.image_formation import GreyLevels, ImageFormation
+from us_sim.slicing.formation.image_formation import GreyMapping, ImageFormation
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
 from us_sim.slicing.settings import GREY_MAPS, Imaging
 
@@ -26,11 +26,11 @@ SPECKLE = np.random.Generator(np.random.PCG64(2)).integers(0, 256, (64, 48), dty
 
 def test_by_default_the_slice_itself_is_the_picture():
     formation = ImageFormation(PROBE, Imaging())
-    assert formation.form([SPECKLE], None) is SPECKLE
+    assert formation.form_picture([SPECKLE], None) is SPECKLE
     assert not formation.needs_contact
-    (plane,) = formation.planes(Pose([0, 0, 0.01]))
-    np.testing.assert_array_equal(plane.origin, PROBE.plane(Pose([0, 0, 0.01])).origin)
-    assert ImageFormation(PROBE, Imaging(time_gain=[0.0, 0.0])).form([SPECKLE]) is SPECKLE
+    (plane,) = formation.make_planes(Pose([0, 0, 0.01]))
+    np.testing.assert_array_equal(plane.origin, PROBE.make_plane(Pose([0, 0, 0.01])).origin)
+    assert ImageFormation(PROBE, Imaging(time_gain=[0.0, 0.0])).form_picture([SPECKLE]) is SPECKLE
 
 
 @pytest.mark.slow
@@ -71,17 +71,19 @@ def test_what_is_off_is_not_imported():
 def test_any_settings_give_a_picture_the_same_one_every_time(imaging, probe, seed):
     random = np.random.Generator(np.random.PCG64(seed))
     formation = ImageFormation(probe, imaging)
-    planes = formation.planes(Pose([0.1, 0.2, 0.3], [0.1, 0.2, 0.3, 0.9]))
+    planes = formation.make_planes(Pose([0.1, 0.2, 0.3], [0.1, 0.2, 0.3, 0.9]))
     assert len(planes) == imaging.elevation_planes
     images = [random.integers(0, 256, (probe.rows, probe.columns), np.uint8) for _ in planes]
     before = [image.copy() for image in images]
     coupling = random.random(probe.lines, dtype=np.float32)
-    picture = formation.form(images, coupling)
+    picture = formation.form_picture(images, coupling)
     assert picture.shape == (probe.rows, probe.columns)
     assert picture.dtype == np.uint8
     if imaging.lateral_resolution or imaging.axial_resolution:  # else slices are black there
         assert not picture[np.isnan(probe.pixel_beams[0])].any()
-    np.testing.assert_array_equal(ImageFormation(probe, imaging).form(images, coupling), picture)
+    np.testing.assert_array_equal(
+        ImageFormation(probe, imaging).form_picture(images, coupling), picture
+    )
     np.testing.assert_array_equal(images, before)  # slices are not drawn on
 
 
@@ -90,7 +92,7 @@ RAMP = np.tile(np.arange(256, dtype=np.uint8), (4, 1))
 
 
 def shown(**settings):
-    return GreyLevels(GREY_PROBE, Imaging(**settings)).shown(RAMP).astype(int)
+    return GreyMapping(GREY_PROBE, Imaging(**settings)).map_levels(RAMP).astype(int)
 
 
 def test_six_decibels_are_a_tenth_of_sixty():
@@ -127,7 +129,7 @@ def test_no_echo_stays_black_and_stronger_echoes_are_never_darker(
 def test_time_gain_is_linear_between_evenly_spaced_depths():
     probe = LinearProbe(aperture=0.04, depth=0.04, columns=2, rows=400)
     image = np.full((400, 2), 60, dtype=np.uint8)
-    picture = GreyLevels(probe, Imaging(time_gain=(0.0, 10.0, 40.0))).shown(image)
+    picture = GreyMapping(probe, Imaging(time_gain=(0.0, 10.0, 40.0))).map_levels(image)
     depth = (np.arange(400) + 0.5) * 1e-4  # m; knots at 0, 20 and 40 mm
     decibels = np.where(depth < 0.02, 500 * depth, 10 + 1500 * (depth - 0.02))
     np.testing.assert_allclose(
@@ -139,7 +141,7 @@ def test_time_gain_is_linear_between_evenly_spaced_depths():
 def test_time_gain_follows_the_beams_of_a_fan():
     probe = ConvexProbe(radius=0.05, opening_angle=1.0, depth=0.1, columns=200, rows=200)
     image = np.full((200, 200), 60, dtype=np.uint8)
-    picture = GreyLevels(probe, Imaging(time_gain=(0.0, 40.0))).shown(image)
+    picture = GreyMapping(probe, Imaging(time_gain=(0.0, 40.0))).map_levels(image)
     to_probe = probe.image_to_probe
     for column, row in ((100, 30), (100, 150), (30, 100), (160, 100)):
         x, _, z, _ = to_probe @ (column, row, 0, 1)

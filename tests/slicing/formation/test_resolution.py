@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.formation.image_formation import WIDTH_PER_SIGMA, Elevation, ImageFormation
 from us_sim.slicing.formation.resolution import Resolution
-from us_sim.slicing.probe.beams import step_depths
+from us_sim.slicing.probe.beams import compute_step_depths
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
 from us_sim.slicing.settings import Imaging
 
@@ -37,7 +37,7 @@ def picture_of_point(probe, line, depth, imaging):
     amplitude = np.exp(-4 * np.log(2) * (x * x + z * z) / POINT**2)
     level = np.round(255 * (1 + 20 * np.log10(np.maximum(amplitude, 1e-9)) / 60))
     image = np.clip(level, 0, 255).astype(np.uint8)
-    return Resolution(probe, imaging).spread(image), at, direction
+    return Resolution(probe, imaging).spread_echoes(image), at, direction
 
 
 def width_along(probe, picture, at, direction, reach=8e-3):
@@ -90,7 +90,9 @@ def test_a_point_loses_the_height_that_its_width_gains():
 @pytest.mark.parametrize("probe", [LINEAR, CONVEX, SECTOR], ids=["linear", "convex", "sector"])
 def test_even_tissue_stays_even_to_the_edges(probe):
     imaging = Imaging(lateral_resolution=2e-3, axial_resolution=1e-3)
-    picture = Resolution(probe, imaging).spread(np.full((probe.rows, probe.columns), 120, np.uint8))
+    picture = Resolution(probe, imaging).spread_echoes(
+        np.full((probe.rows, probe.columns), 120, np.uint8)
+    )
     reached = np.isfinite(probe.pixel_beams[0])
     assert (picture[reached] == 120).all()
     assert (picture[~reached] == 0).all()
@@ -111,7 +113,7 @@ def test_weights_have_the_moments_of_the_beam(planes, width, focus):
         probe(focus=focus), Imaging(elevation_planes=planes, elevation_width=width)
     )
     weights, y = elevation.weights, elevation.offsets
-    depth = step_depths(probe())
+    depth = compute_step_depths(probe())
     sigma = width / WIDTH_PER_SIGMA * np.sqrt(1 + ((depth - focus) / focus) ** 2)
     np.testing.assert_allclose(weights.sum(axis=1), 1.0, rtol=1e-12)
     np.testing.assert_allclose(weights @ y, 0.0, atol=1e-9 * width)
@@ -120,8 +122,8 @@ def test_weights_have_the_moments_of_the_beam(planes, width, focus):
 
 def test_planes_are_parallel_and_lie_across_the_image():
     turned = Pose([0.01, 0.02, 0.03], [0.1, 0.2, 0.3, 0.9])
-    planes = ImageFormation(probe(), Imaging(elevation_planes=3)).planes(turned)
-    middle = probe().plane(turned)
+    planes = ImageFormation(probe(), Imaging(elevation_planes=3)).make_planes(turned)
+    middle = probe().make_plane(turned)
     np.testing.assert_allclose(planes[1].origin, middle.origin, atol=1e-15)
     step = planes[2].origin - planes[1].origin
     np.testing.assert_allclose(step, planes[1].origin - planes[0].origin, atol=1e-15)

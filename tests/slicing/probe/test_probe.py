@@ -11,7 +11,12 @@ from hypothesis import strategies as st
 from us_sim.errors import ProbeError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting.slicer import create_slicer
-from us_sim.slicing.probe.beams import beam_angles, fractions_and_depths, pixels_of, require_depth
+from us_sim.slicing.probe.beams import (
+    compute_beam_angles,
+    compute_beam_coordinates,
+    convert_to_pixels,
+    require_depth,
+)
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
@@ -154,7 +159,7 @@ def test_each_sample_of_a_beam_lies_at_its_pixel(probe):
 def test_the_plane_is_the_image_to_probe_map_moved_by_the_pose(probe, position, orientation):
     pose = Pose(position, orientation)
     x, z = pixel_positions(probe)
-    expected = pose.apply(np.stack([x, 0 * x, z], -1).reshape(-1, 3))
+    expected = pose.transform_points(np.stack([x, 0 * x, z], -1).reshape(-1, 3))
     np.testing.assert_allclose(probe.plane(pose).pixels().reshape(-1, 3), expected, atol=1e-12)
     scale = probe.image_to_probe[:3, :3] / np.append(probe.pixel_spacing, 1.0)
     np.testing.assert_allclose(scale.T @ scale, np.eye(3), atol=1e-12)
@@ -225,8 +230,8 @@ def test_wires_appear_at_their_millimetre(name):
     volume = wire_phantom(pose, wires)
     mesh = box_mesh(*(uniform_planes(-0.06, 0.06, 3) for _ in range(2)), uniform_planes(0, 0.08, 3))
     slicer = create_slicer("scan_conversion", volume, mesh.nodes, mesh.tetrahedra)
-    image = slicer.image(mesh.nodes, probe.plane(pose)).astype(float)
-    assert not image[~probe.plane(pose).is_shown()].any()
+    image = slicer.cut_image(mesh.nodes, probe.make_plane(pose)).astype(float)
+    assert not image[~probe.make_plane(pose).make_shown_mask()].any()
     x, z = 1e3 * np.array(pixel_positions(probe))
     line, way = probe.pixel_beams.astype(float)
     for (across, depth), (wire_x, wire_z) in zip(places, wires, strict=True):
@@ -305,7 +310,7 @@ def test_spans_beyond_the_image_are_refused(spans):
         SlicePlane(**steps, columns=5, rows=4, spans=spans)
     runs = np.zeros((4, 2, 2), dtype=np.int64)
     runs[:, 0] = [1, 4]
-    shown = SlicePlane(**steps, columns=5, rows=4, spans=runs).is_shown()
+    shown = SlicePlane(**steps, columns=5, rows=4, spans=runs).make_shown_mask()
     np.testing.assert_array_equal(shown, np.tile([False, True, True, True, False], (4, 1)))
 
 
@@ -322,9 +327,9 @@ STEERED = [
 def test_every_pixel_lies_where_its_own_beam_and_depth_lead(probe):
     if probe.lines == 1:
         return  # between the lines of one line there is nothing
-    fraction, depth = fractions_and_depths(probe)
+    fraction, depth = compute_beam_coordinates(probe)
     row, column = np.nonzero(~np.isnan(depth))
-    places = pixels_of(probe, fraction[row, column], depth[row, column])
+    places = convert_to_pixels(probe, fraction[row, column], depth[row, column])
     # Where beams leave one point, the start between two lines is between their starts.
     assert np.abs(places - np.column_stack([column, row])).max() < 0.02
 
@@ -333,11 +338,12 @@ def test_every_pixel_lies_where_its_own_beam_and_depth_lead(probe):
 def test_a_steered_beam_leaves_its_upright_one_by_the_angle(fraction, depth, angle):
     probe = STEERED[0]
     upright, steered = (
-        pixels_of(probe, np.array([fraction]), np.array([depth]), turn)[0] for turn in (0.0, angle)
+        convert_to_pixels(probe, np.array([fraction]), np.array([depth]), turn)[0]
+        for turn in (0.0, angle)
     )
     moved = (steered - upright) * probe.pixel_spacing
     assert moved == pytest.approx([depth * np.sin(angle), depth * (np.cos(angle) - 1)], abs=1e-9)
-    assert beam_angles(probe, np.array([fraction]), angle)[0] == pytest.approx(angle)
+    assert compute_beam_angles(probe, np.array([fraction]), angle)[0] == pytest.approx(angle)
 
 
 def test_a_depth_outside_the_image_is_refused_and_none_is_its_middle():

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from us_sim.tissue.contact.complementarity import unilateral
+from us_sim.tissue.contact.complementarity import solve_unilateral
 
 
 def enumerated(delassus, gap):
@@ -27,7 +27,7 @@ def test_agrees_with_enumeration(seed):
     root = random.normal(size=(7, 7))
     delassus = root @ root.T + 0.1 * np.eye(7)
     gap = random.normal(size=7)
-    push, active = unilateral(delassus, gap, random.random(7) < 0.5)
+    push, active = solve_unilateral(delassus, gap, random.random(7) < 0.5)
     np.testing.assert_allclose(push, enumerated(delassus, gap), atol=1e-9)
     np.testing.assert_array_equal(active, push > 0)
 
@@ -40,7 +40,7 @@ def test_gaps_and_pushes_are_complementary_even_with_redundant_rows(count, rank,
     delassus = root @ root.T
     gap = -delassus @ np.maximum(random.normal(size=count), 0)
     gap += (random.random(count) < 0.5) * np.abs(gap).max() * random.random(count)
-    push, active = unilateral(delassus, gap, random.random(count) < 0.5)
+    push, active = solve_unilateral(delassus, gap, random.random(count) < 0.5)
     opened = delassus @ push + gap
     scale = max(np.abs(gap).max(), 1e-300)
     assert (push >= 0).all()
@@ -57,14 +57,14 @@ def test_a_problem_that_takes_too_many_pivots_is_solved_by_relaxation():
     root = np.tril(np.full((count, count), 2.0), -1) + np.eye(count)
     delassus = (root @ root.T)[::-1, ::-1]
     gap = -np.cumsum(2.0 ** np.arange(count, 0, -1))[::-1]
-    force, active = unilateral(delassus, gap, np.zeros(count, dtype=bool))
+    force, active = solve_unilateral(delassus, gap, np.zeros(count, dtype=bool))
     # The node of the smallest gap carries all, and opens the others by more than they need.
     np.testing.assert_allclose(force, [*[0.0] * (count - 1), 2.0**count], rtol=1e-12)
     np.testing.assert_array_equal(active, force > 0.0)
 
 
 def test_nobody_is_pushed_where_nothing_is_entered():
-    push, active = unilateral(np.eye(3), np.array([0.0, 1.0, 2.0]), np.ones(3, dtype=bool))
+    push, active = solve_unilateral(np.eye(3), np.array([0.0, 1.0, 2.0]), np.ones(3, dtype=bool))
     assert not push.any()
     assert not active.any()
-    assert unilateral(np.empty((0, 0)), np.empty(0), np.empty(0, dtype=bool))[0].shape == (0,)
+    assert solve_unilateral(np.empty((0, 0)), np.empty(0), np.empty(0, dtype=bool))[0].shape == (0,)

@@ -41,7 +41,7 @@ def contact_of(probe, count, stiffness=STIFF, strongest=STRONG):
 
 def contact_at(probe, where, pose=TURNED):
     """A contact of points (P, 3) of the probe's frame, and these in the patient's."""
-    positions = pose.apply(np.array(where, dtype=float))
+    positions = pose.transform_points(np.array(where, dtype=float))
     contact = contact_of(probe, len(positions))
     contact.set_pose(pose, positions)
     contact.drop_planes(positions)
@@ -179,7 +179,7 @@ def test_a_length_along_a_change_minimises_the_energy(probe, where, seed, pull, 
         return length * curvature * 1e-2 - pull - contact.work_along(start, change, length)
 
     assume(slope(0.0) < 0.0)
-    length = contact.length_along(start, change, pull, curvature * 1e-2)
+    length = contact.find_best_length(start, change, pull, curvature * 1e-2)
     if slope(1.0) <= 0.1 * abs(slope(0.0)):  # what is overshot does not matter
         assert length == 1.0
     else:
@@ -230,7 +230,7 @@ def test_a_flat_face_relieves_nothing_and_an_edge_no_more_than_springs_stiffen_i
     astride = flat + np.array([0.048, 0.0, 0.0])
     astride[1, 0] += 0.01  # far beside the edge at 50 mm; the middle is below it
     contact, points = triangle_on(plate, astride - [0.006, 0.0, 0.0])
-    before = FlaredProbe(plate, 0.01).distance(Pose(), points)[0]
+    before = FlaredProbe(plate, 0.01).measure_distances(Pose(), points)[0]
     contact.set_pose(Pose(), points)
     relief = contact.gap - before
     np.testing.assert_array_equal(relief[:3], 0.0)

@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
-from us_sim.geometry.collider_distance import signed_distance
+from us_sim.geometry.collider_distance import measure_distances
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.triangles import part_size
+from us_sim.geometry.triangles import choose_part_size
 from us_sim.tissue.contact.active_set import ActiveSet
-from us_sim.tissue.contact.probe_gap import FlaredProbe, push_out, wrench_on_probe
+from us_sim.tissue.contact.probe_gap import FlaredProbe, measure_gaps, wrench_on_probe
 from us_sim.tissue.contact.surface_points import SurfacePoints
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import uniform_material
+from us_sim.tissue.elasticity.materials import make_uniform_materials
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.tissue.model import TissueModel, face_nodes
 from us_sim.tissue.solvers.solver import create_solver
@@ -33,7 +33,7 @@ depth = st.floats(-0.05, 0.02)
 
 
 def gap_at(collider, where, spacing, pose=None):
-    gap, normal = push_out(collider, pose or Pose(), np.array([where], dtype=float), spacing)
+    gap, normal = measure_gaps(collider, pose or Pose(), np.array([where], dtype=float), spacing)
     return gap[0], normal[0]
 
 
@@ -41,7 +41,7 @@ def gap_at(collider, where, spacing, pose=None):
 @given(lateral, lateral, st.floats(-0.02, 0.02))
 def test_outside_and_a_little_inside_the_gap_is_the_signed_distance(x, y, z):
     where = np.array([[x, y, z]])
-    distance, normal = signed_distance(SPHERE, Pose(), where)
+    distance, normal = measure_distances(SPHERE, Pose(), where)
     if distance[0] < -0.015 or normal[0, 2] < 0:
         return
     gap, direction = gap_at(SPHERE, where[0], FINE)
@@ -60,7 +60,7 @@ def test_what_is_pushed_is_pushed_out_and_never_back(collider, x, y, z):
         return
     assert normal[2] >= 0
     landed = np.array([[x, y, z]]) - gap * normal
-    distance, _ = signed_distance(collider, Pose(), landed)
+    distance, _ = measure_distances(collider, Pose(), landed)
     assert distance[0] >= -1e-9
 
 
@@ -86,7 +86,7 @@ def test_an_unresolved_rounding_pushes_forward_onto_the_surface():
     gap, normal = gap_at(BOX, (0.0, 0.0065, -0.002), FINE)  # 2 mm out on the rounding of 3 mm
     np.testing.assert_allclose(normal, [0, 0, 1])
     landed = np.array([[0.0, 0.0065, -0.002 - gap]])
-    assert signed_distance(BOX, Pose(), landed)[0][0] == pytest.approx(0.0, abs=1e-12)
+    assert measure_distances(BOX, Pose(), landed)[0][0] == pytest.approx(0.0, abs=1e-12)
     assert gap_at(BOX, (0.0, 0.0076, -0.01), FINE)[0] == np.inf
 
 
@@ -110,7 +110,7 @@ def pressed_by_a_curved_face(method):
         *(uniform_planes(-0.05, 0.05, 13) for _ in range(2)), uniform_planes(0, 0.05, 6)
     )
     fixed = mesh.nodes[:, 2] == 0.05
-    material = uniform_material(mesh, Material(1e4, 0.45))
+    material = make_uniform_materials(mesh, Material(1e4, 0.45))
     model = TissueModel(mesh, material, fixed, CONVEX, face_nodes(mesh, "top"))
     solver = create_solver(method, model)
     for depth in (0.003, 0.006, 0.009, 0.009, 0.009):
@@ -126,9 +126,9 @@ def pressed_by_a_curved_face(method):
 def test_tissue_takes_the_shape_of_a_curved_face():
     model, pressed, deformation = pressed_by_a_curved_face("fem")
     touching = deformation.nodes[deformation.contact_nodes]
-    np.testing.assert_allclose(signed_distance(CONVEX, pressed, touching)[0], 0.0, atol=1e-5)
+    np.testing.assert_allclose(measure_distances(CONVEX, pressed, touching)[0], 0.0, atol=1e-5)
     free = np.setdiff1d(np.arange(len(model.mesh.nodes)), deformation.contact_nodes)
-    assert signed_distance(CONVEX, pressed, deformation.nodes[free])[0].min() > -1e-5
+    assert measure_distances(CONVEX, pressed, deformation.nodes[free])[0].min() > -1e-5
 
 
 @pytest.mark.slow
@@ -139,15 +139,17 @@ def test_a_curved_face_sinks_into_the_points_of_a_surface_on_springs():
     model, pressed, deformation = pressed_by_a_curved_face("fem_nonlinear")
     spacing = model.contact_spacing
     displacement = (deformation.nodes - model.mesh.nodes).T
-    points = SurfacePoints(model, part_size(CONVEX.rounding, spacing))
-    distance, _ = signed_distance(CONVEX, pressed, points.rest + points.moved(displacement))
+    points = SurfacePoints(model, choose_part_size(CONVEX.rounding, spacing))
+    distance, _ = measure_distances(
+        CONVEX, pressed, points.rest + points.interpolate_field(displacement)
+    )
     assert -0.125 * spacing < distance.min() < 0.0
     touching = deformation.nodes[deformation.contact_nodes]
-    off = signed_distance(CONVEX, pressed, touching)[0]
+    off = measure_distances(CONVEX, pressed, touching)[0]
     assert -0.1 * spacing < off.min()
     assert off.max() < 0.1 * spacing + spacing**2 / (2 * CONVEX.radius)
     free = np.setdiff1d(np.arange(len(model.mesh.nodes)), deformation.contact_nodes)
-    assert signed_distance(CONVEX, pressed, deformation.nodes[free])[0].min() > 0.0
+    assert measure_distances(CONVEX, pressed, deformation.nodes[free])[0].min() > 0.0
 
 
 def test_wrench_is_the_reaction_about_the_probes_origin():
@@ -168,7 +170,7 @@ def test_touched_nodes_lie_on_the_probe():
     pose = Pose(np.array([0.0, 0.0, 0.01]))
     assert contact.update(pose, displacement)
     np.testing.assert_array_equal(contact.touched, [True, True, False])
-    distance, _ = signed_distance(SPHERE, pose, REST + displacement)
+    distance, _ = measure_distances(SPHERE, pose, REST + displacement)
     np.testing.assert_allclose(distance[:2], 0, atol=1e-9)
     np.testing.assert_array_equal(displacement[2], 0)
     assert not contact.update(pose, displacement)
@@ -218,7 +220,7 @@ EXAMPLES = settings(deadline=None, max_examples=80)
 
 
 def distance_at(probe, where, pose=None):
-    gap, normal = probe.distance(pose or Pose(), np.array([where], dtype=float))
+    gap, normal = probe.measure_distances(pose or Pose(), np.array([where], dtype=float))
     return gap[0], normal[0]
 
 
@@ -226,7 +228,7 @@ def distance_at(probe, where, pose=None):
 @given(colliders, spacings, places, places, st.floats(0.0, 1.0))
 def test_the_distance_is_convex(collider, spacing, a, b, share):
     probe = FlaredProbe(collider, spacing)
-    gap, _ = probe.distance(Pose(), np.array([a, b, (1 - share) * a + share * b]))
+    gap, _ = probe.measure_distances(Pose(), np.array([a, b, (1 - share) * a + share * b]))
     assert gap[2] <= (1 - share) * gap[0] + share * gap[1] + 1e-12
 
 
@@ -237,7 +239,7 @@ def test_the_distance_is_convex_deep_in_the_core_too(collider, spacing):
     probe, rng = FlaredProbe(collider, spacing), np.random.default_rng(0)
     a = rng.uniform([-0.02, -0.002, -0.05], [0.02, 0.002, -0.01], (20000, 3))
     b = a + rng.normal(size=a.shape) * 0.003
-    gaps = [probe.distance(Pose(), points)[0] for points in (a, b, 0.5 * (a + b))]
+    gaps = [probe.measure_distances(Pose(), points)[0] for points in (a, b, 0.5 * (a + b))]
     assert (gaps[2] - 0.5 * (gaps[0] + gaps[1])).max() < 1e-12
 
 
@@ -248,7 +250,7 @@ def test_the_normal_is_the_distances_gradient_and_its_length_is_one(collider, sp
     _, normal = distance_at(probe, where)
     assert np.linalg.norm(normal) == pytest.approx(1.0)
     around = np.concatenate([where + step * np.eye(3), where - step * np.eye(3)])
-    gap, normals = probe.distance(Pose(), around)
+    gap, normals = probe.measure_distances(Pose(), around)
     assume(np.abs(normals - normal).max() < 1e-3)  # inside the core there are creases
     np.testing.assert_allclose((gap[:3] - gap[3:]) / (2 * step), normal, atol=1e-3)
 
@@ -258,7 +260,7 @@ def test_the_normal_is_the_distances_gradient_and_its_length_is_one(collider, sp
 def test_the_curvature_is_how_the_normal_turns(collider, spacing, where):
     probe, step = FlaredProbe(collider, spacing), 1e-7
     around = where + np.concatenate([s * np.eye(3) for s in (-2 * step, -step, step, 2 * step)])
-    normals = probe.distance(Pose(), around)[1].reshape(4, 3, 3)
+    normals = probe.measure_distances(Pose(), around)[1].reshape(4, 3, 3)
     turn = (normals[2] - normals[1]).T / (2 * step)
     wider = (normals[3] - normals[0]).T / (4 * step)
     assume(np.abs(turn - wider).max() < 1.0)  # it jumps where flat parts and bent ones meet
@@ -270,7 +272,7 @@ def test_the_curvature_is_how_the_normal_turns(collider, spacing, where):
 @EXAMPLES
 @given(colliders, spacings, places)
 def test_before_the_front_it_is_the_distance_of_the_collider(collider, spacing, where):
-    expected, direction = signed_distance(collider, Pose(), where[None])
+    expected, direction = measure_distances(collider, Pose(), where[None])
     x, y, z = direction[0]
     assume(expected[0] > -collider.offset_box[3])
     # The flanks begin where the rounding is 60 degrees steep.
@@ -285,7 +287,7 @@ def test_before_the_front_it_is_the_distance_of_the_collider(collider, spacing, 
 def test_a_rounding_that_the_nodes_resolve_keeps_its_own_flanks(collider, where):
     box = collider.offset_box
     where[2] = max(where[2], -box[3] - 2 * box[2])  # behind that it goes on
-    expected, direction = signed_distance(collider, Pose(), where[None])
+    expected, direction = measure_distances(collider, Pose(), where[None])
     assume(expected[0] > -0.99 * box[3])
     gap, normal = distance_at(FlaredProbe(collider, RESOLVING), where)
     assert gap == pytest.approx(expected[0], abs=1e-12)
@@ -313,10 +315,10 @@ def test_it_moves_with_the_probe(collider, spacing, where):
     probe = FlaredProbe(collider, spacing)
     gap, normal = distance_at(probe, where)
     turn = probe.curvature(Pose(), where[None])[0]
-    there = TURNED.apply(where[None])
+    there = TURNED.transform_points(where[None])
     near = where + 1e-9 * np.concatenate([np.eye(3), -np.eye(3)])
     # Rounding may put a point on the other side of a crease.
-    assume(np.abs(probe.distance(Pose(), near)[1] - normal).max() < 1e-5)
+    assume(np.abs(probe.measure_distances(Pose(), near)[1] - normal).max() < 1e-5)
     assume(np.abs(probe.curvature(Pose(), near) - turn).max() < 1e-2)
     moved, direction = distance_at(probe, there[0], TURNED)
     assert moved == pytest.approx(gap, abs=1e-12)
@@ -346,7 +348,7 @@ def test_points_enter_through_the_plane_that_touches_where_their_way_goes_in(
     assume(cosine > 0.1)  # or it only grazes the shape
     # A probe that moved by the opposite, past a point that stayed.
     last = Pose(pose.position - pose.rotation @ (came - there), pose.orientation)
-    gap, found = probe.entered(last, pose, pose.apply(there[None]))
+    gap, found = probe.find_entry_planes(last, pose, pose.apply(there[None]))
     found = pose.rotation.T @ found[0]
     off = 1e-6 / (cosine * collider.offset_box[3])  # angle, of a micrometre before the shape
     np.testing.assert_allclose(found, normal, atol=5 * off)
@@ -354,12 +356,12 @@ def test_points_enter_through_the_plane_that_touches_where_their_way_goes_in(
     # The whole shape is behind the plane.
     along = np.linalg.svd(found[None])[2][1:]
     plane = there - gap[0] * found + 0.05 * (np.array([[1, 0], [-1, 0], [0, 1], [0, -1]]) @ along)
-    assert probe.distance(Pose(), plane)[0].min() > -1e-9
+    assert probe.measure_distances(Pose(), plane)[0].min() > -1e-9
 
 
 def test_a_point_that_was_inside_is_pushed_out_where_it_was():
     probe = FlaredProbe(SMALL_SPHERE, RESOLVING)
     last = Pose(position=[0.0, 0.0, -0.02])
-    gap, normal = probe.entered(last, Pose(), np.array([[0.0, 0.0, -0.021]]))
+    gap, normal = probe.find_entry_planes(last, Pose(), np.array([[0.0, 0.0, -0.021]]))
     assert gap[0] == pytest.approx(-0.021)
     np.testing.assert_allclose(normal[0], [0.0, 0.0, 1.0])

@@ -13,7 +13,7 @@ from us_sim.tissue.contact.surface_points import (
     SurfacePoints,
     add_springs,
     add_turns,
-    surface_contact,
+    make_surface_contact,
 )
 from us_sim.tissue.elasticity.linear_tetrahedra import nodal_shear_stiffness
 from us_sim.tissue.model import TissueModel
@@ -50,7 +50,9 @@ def test_points_stand_for_equal_parts_no_longer_than_the_size(size):
     np.testing.assert_allclose(points.weights.sum(axis=1), 1.0)
     assert points.weights.min() >= 0.0
     # The top of the block is 0.2 by 0.1 m, where z is 0.
-    assert points.at_nodes(points.spread(np.ones(COUNT))).sum() == pytest.approx(5 * 4)
+    assert points.sum_at_nodes(points.spread_to_points(np.ones(COUNT))).sum() == pytest.approx(
+        5 * 4
+    )
     np.testing.assert_array_equal(points.rest[:, 2], 0.0)
 
 
@@ -58,7 +60,7 @@ def test_points_stand_for_equal_parts_no_longer_than_the_size(size):
 @given(SIZES, seeds)
 def test_what_is_spread_has_the_same_sum(size, seed):
     values = np.random.default_rng(seed).normal(size=COUNT)
-    spread = points_of(size).spread(values)
+    spread = points_of(size).spread_to_points(values)
     assert spread.sum() == pytest.approx(values[MODEL.contact_nodes].sum(), abs=1e-12)
 
 
@@ -75,7 +77,7 @@ def test_a_uniform_pressure_gives_the_nodal_forces_of_linear_shape_functions(siz
     whole = 0.5 * np.linalg.norm(normal, axis=1)
     _, which, count = np.unique(points.nodes, axis=0, return_inverse=True, return_counts=True)
     pressure = whole / count[which.ravel()]  # of 1 Pa, on equal parts
-    np.testing.assert_allclose(points.at_nodes(pressure), exact, atol=1e-15)
+    np.testing.assert_allclose(points.sum_at_nodes(pressure), exact, atol=1e-15)
 
 
 @EXAMPLES
@@ -83,13 +85,13 @@ def test_a_uniform_pressure_gives_the_nodal_forces_of_linear_shape_functions(siz
 def test_force_and_torque_of_the_points_are_those_of_the_nodes(size, seed):
     points, rng = points_of(size), np.random.default_rng(seed)
     displacement, force = rng.normal(size=(3, COUNT)), rng.normal(size=points.rest.shape)
-    places = points.rest + points.moved(displacement)
+    places = points.rest + points.interpolate_field(displacement)
     nodes, pushes = MODEL.mesh.nodes + displacement.T, np.zeros((3, COUNT))
-    points.add(force, pushes, np.arange(len(force)))
+    points.add_to_nodes(force, pushes, np.arange(len(force)))
     np.testing.assert_allclose(pushes.sum(axis=1), force.sum(axis=0), atol=1e-9)
     torque = np.cross(nodes, pushes.T).sum(axis=0)
     np.testing.assert_allclose(torque, np.cross(places, force).sum(axis=0), atol=1e-9)
-    np.testing.assert_allclose(points.at_nodes(force), pushes.T, atol=1e-12)
+    np.testing.assert_allclose(points.sum_at_nodes(force), pushes.T, atol=1e-12)
 
 
 @EXAMPLES
@@ -98,8 +100,8 @@ def test_moving_and_adding_are_adjoint_for_some_points_too(size, seed):
     points, rng = points_of(size), np.random.default_rng(seed)
     some = np.flatnonzero(rng.random(len(points.rest)) < 0.5)
     field, vectors = rng.normal(size=(3, COUNT)), rng.normal(size=points.rest.shape)
-    moved, image = points.moved(field, some), np.zeros((3, COUNT))
-    points.add(vectors, image, some)
+    moved, image = points.interpolate_field(field, some), np.zeros((3, COUNT))
+    points.add_to_nodes(vectors, image, some)
     assert (moved * vectors).sum() == pytest.approx((field * image).sum())
     assert not np.delete(moved, some, axis=0).any()
 
@@ -112,7 +114,7 @@ def test_springs_and_turns_are_dense_matrices_of_the_points(seed):
     directions = rng.normal(size=(20, 3))
     stiffness, turn = rng.uniform(0.0, 1e4, 20), rng.normal(size=(20, 3, 3))
     field = rng.normal(size=(3, COUNT))
-    moved = points.moved(field)[active]
+    moved = points.interpolate_field(field)[active]
     own = points.nodes[active], points.weights[active]
     for tensors, add, given_ in [
         (np.einsum("k,ki,kj->kij", stiffness, directions, directions), add_springs, directions),
@@ -121,7 +123,7 @@ def test_springs_and_turns_are_dense_matrices_of_the_points(seed):
         forces = np.zeros_like(points.rest)
         forces[active] = np.einsum("kij,kj->ki", tensors, moved)
         expected, image = np.ones((3, COUNT)), np.ones((3, COUNT))
-        points.add(forces, expected, active)
+        points.add_to_nodes(forces, expected, active)
         add(*own, given_, *([stiffness] if add is add_springs else []), field, image)
         np.testing.assert_allclose(image, expected, atol=1e-9 * abs(expected).max())
 
@@ -138,7 +140,7 @@ def test_lumped_springs_are_a_little_less_than_the_tensors_of_the_nodes(seed):
     for p, n, k in zip(active, directions, stiffness, strict=True):
         for node, weight in zip(points.nodes[p], points.weights[p], strict=True):
             tensors[node] += 0.5 * k * weight * np.outer(n, n)
-    nodes, along, firm = points.lumped(active, directions, stiffness)
+    nodes, along, firm = points.lump_springs(active, directions, stiffness)
     for node, n, k in zip(nodes, along, firm, strict=True):
         lumped[node] += k * np.outer(n, n)
     assert (np.diff(np.flatnonzero(np.diff(nodes, prepend=-1))) <= 3).all()  # of a node in a row
@@ -154,9 +156,9 @@ def test_a_node_that_is_no_triangles_is_a_point_by_itself():
     points = SurfacePoints(with_contact_nodes([lone]), 0.01)
     np.testing.assert_array_equal(points.rest, MODEL.mesh.nodes[[lone]])
     values = np.arange(COUNT, dtype=float)
-    np.testing.assert_allclose(points.spread(values), [lone])
-    np.testing.assert_allclose(points.at_nodes(np.array([2.0]))[lone], 2.0)
-    gap, normal, softness = points.nodal_springs(
+    np.testing.assert_allclose(points.spread_to_points(values), [lone])
+    np.testing.assert_allclose(points.sum_at_nodes(np.array([2.0]))[lone], 2.0)
+    gap, normal, softness = points.merge_springs(
         np.array([50.0]), np.array([-0.001]), np.array([[0.0, 0.6, 0.8]])
     )
     assert gap[lone] == pytest.approx(-0.001)
@@ -179,7 +181,7 @@ def test_triangles_that_cannot_move_at_all_have_no_points():
 
 
 def test_the_springs_of_a_contact_are_as_firm_as_the_tissues_shear():
-    points, contact = surface_contact(MODEL)
+    points, contact = make_surface_contact(MODEL)
     own = nodal_shear_stiffness(MODEL.mesh, MODEL.materials)
     assert contact.stiffness.sum() == pytest.approx(40 * own[MODEL.contact_nodes].sum())
     assert len(contact.gap) == len(points.rest)

@@ -18,7 +18,7 @@ from us_sim.tissue.elasticity.materials import (
     TissueMaterials,
     average_over_labels,
     label_fractions,
-    uniform_material,
+    make_uniform_materials,
     volumetric_split,
 )
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
@@ -57,12 +57,14 @@ def test_a_block_of_lumen_under_a_pressure_has_the_area_of_the_law(outside):
     # p (m^2 - 1) = -outside where m = 1 - (1 - j) / 0.2, of a block that keeps its length
     ratio = 1 - 0.2 * (1 - np.sqrt(1 - outside / 1000.0))
     mesh = block_mesh((3, 3, 3))
-    tissue = NeoHookean(mesh, uniform_material(mesh, VEIN), np.float64)
+    tissue = NeoHookean(mesh, make_uniform_materials(mesh, VEIN), np.float64)
 
     def excess(area):
         """The pressure on the sides of the block, narrowed alike, beyond ``outside``."""
         narrow = np.sqrt(area) - 1
-        forces = tissue.forces(np.ascontiguousarray(mesh.nodes.T * [[0.0], [narrow], [narrow]]))
+        forces = tissue.compute_forces(
+            np.ascontiguousarray(mesh.nodes.T * [[0.0], [narrow], [narrow]])
+        )
         top = mesh.nodes[:, 2] > 0.1 - 1e-9
         return -forces[2, top].sum() / (0.2 * 0.1 * (1 + narrow)) - outside
 
@@ -149,7 +151,9 @@ def test_a_lumen_that_empties_does_not_move_its_neighbours_averages(mesh):
     solid = split.shear * plain + (split.element + split.nodal) / 2 * 0.488**2
     hollow = 0.05 * split.shear * plain + 1000.0 * (0.2 * 2 / 3 + 0.8 - 0.512)
     expected = (mesh.volumes * np.where(lumen, hollow, solid)).sum()
-    assert tissue.energy(np.ascontiguousarray(shrunk.T)) == pytest.approx(expected, rel=1e-9)
+    assert tissue.compute_energy(np.ascontiguousarray(shrunk.T)) == pytest.approx(
+        expected, rel=1e-9
+    )
 
 
 def test_fractions_are_those_of_the_labels_and_pressures_those_of_the_lumens():
@@ -166,7 +170,7 @@ def test_fractions_are_those_of_the_labels_and_pressures_those_of_the_lumens():
     solid = average_over_labels(fractions, {1: MUSCLE, 2: MUSCLE})
     assert not solid.lumen_fraction.any()
     assert not solid.lumen_pressure.any()
-    assert uniform_material(mesh, VEIN).lumen_pressure.tolist() == [1000.0] * 5
+    assert make_uniform_materials(mesh, VEIN).lumen_pressure.tolist() == [1000.0] * 5
 
 
 OUTER, INNER = 0.012, 0.003  # m, radii of a cylinder of tissue and of the lumen along its axis
@@ -203,7 +207,10 @@ def tube(inwards, poisson_ratio, across=25):
         return field
 
     found = minimize(
-        lambda u: (1e6 * tissue.energy(moved(u)), 1e3 * tissue.forces(moved(u))[free]),
+        lambda u: (
+            1e6 * tissue.compute_energy(moved(u)),
+            1e3 * tissue.compute_forces(moved(u))[free],
+        ),
         rest[free] * 1e3,
         jac=True,
         method="L-BFGS-B",
@@ -214,7 +221,7 @@ def tube(inwards, poisson_ratio, across=25):
         "tai,taj->tij", field.T[mesh.tetrahedra], shape_gradients(mesh)
     )
     inside = mesh.volumes * lumen
-    push = (tissue.forces(field) * across_tube)[:, rim].sum()
+    push = (tissue.compute_forces(field) * across_tube)[:, rim].sum()
     area = 2 * np.pi * (OUTER - inwards) * thick
     return inside @ np.linalg.det(gradients) / inside.sum(), push / area
 
@@ -276,10 +283,10 @@ def test_a_tube_in_incompressible_tissue_closes_at_the_pressure_of_the_blood_and
 
 def test_a_model_that_is_lumen_everywhere_is_refused():
     mesh = block_mesh((4, 3, 3))
-    model = block((4, 3, 3), materials=uniform_material(mesh, VEIN))
+    model = block((4, 3, 3), materials=make_uniform_materials(mesh, VEIN))
     with pytest.raises(SolverError, match="lumen everywhere"):
         FemNonlinear(model)
-    require_solid(mesh, uniform_material(mesh, MUSCLE))
+    require_solid(mesh, make_uniform_materials(mesh, MUSCLE))
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tissue_block import block_mesh
 
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import uniform_material
+from us_sim.tissue.elasticity.materials import make_uniform_materials
 from us_sim.tissue.elasticity.neo_hookean_material import barrier_modulus, barrier_strength
 
 MESH = block_mesh((4, 3, 3))
@@ -47,7 +47,7 @@ def test_it_is_never_below_the_tissues_own_nor_above_the_stiffest(shear):
 
 
 def withstood(shear):
-    soft = uniform_material(MESH, Material(3.0, 0.25, 1000.0))
+    soft = make_uniform_materials(MESH, Material(3.0, 0.25, 1000.0))
     return barrier_strength(MESH, replace(soft, young_modulus=2.5 * shear))
 
 

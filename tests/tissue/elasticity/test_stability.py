@@ -10,12 +10,12 @@ from scipy.linalg import eigh
 from tissue_block import SOFT, block, block_mesh
 
 from us_sim.errors import SolverError
-from us_sim.tissue.elasticity.materials import uniform_material
-from us_sim.tissue.elasticity.springs import SpringNetwork, fitted_springs, springs_of
+from us_sim.tissue.elasticity.materials import make_uniform_materials
+from us_sim.tissue.elasticity.springs import SpringNetwork, build_springs, fit_springs
 from us_sim.tissue.elasticity.stability import (
     ElasticResidual,
+    bound_node_stiffness,
     highest_frequency,
-    node_stiffness,
     stabilise,
     step_limit,
 )
@@ -40,10 +40,10 @@ def test_a_chain_between_two_walls(count):
     nodes, springs = chain(count + 2)
     fixed = np.zeros(count + 2, bool)
     fixed[[0, -1]] = True
-    frequency = highest_frequency(springs.factor(nodes), np.full(count + 2, 4.0), fixed)
+    frequency = highest_frequency(springs.factor_stiffness(nodes), np.full(count + 2, 4.0), fixed)
     exact = 2 * math.sqrt(100.0 / 4.0) * math.sin(count * math.pi / (2 * (count + 1)))
     assert frequency == pytest.approx(exact, rel=1e-3)
-    bound = node_stiffness(springs.factor(nodes))
+    bound = bound_node_stiffness(springs.factor_stiffness(nodes))
     np.testing.assert_allclose(bound[1:-1], 200.0)
     assert frequency**2 <= 2 * 200.0 / 4.0
 
@@ -63,7 +63,7 @@ def test_at_the_limit_a_root_of_the_amplification_has_size_one(frequency, dampin
 def test_highest_frequency_is_the_dense_eigenvalue(held):
     fixed = (MESH.nodes[:, 2] == 0.1) & held
     mass = np.random.default_rng(3).uniform(0.01, 0.1, len(MESH.nodes))
-    springs = fitted_springs(MESH, uniform_material(MESH, SOFT))
+    springs = fit_springs(MESH, make_uniform_materials(MESH, SOFT))
     # Differences of the forces themselves: an independent linearisation.
     count, step = MESH.nodes.size, 1e-7
     still = np.zeros_like(MESH.nodes)
@@ -73,7 +73,7 @@ def test_highest_frequency_is_the_dense_eigenvalue(held):
         moved[i] = step
         here = MESH.nodes + moved.reshape(-1, 3)
         there = MESH.nodes - moved.reshape(-1, 3)
-        change = springs.forces(there, still) - springs.forces(here, still)
+        change = springs.compute_forces(there, still) - springs.compute_forces(here, still)
         matrix[:, i] = change.ravel() / (2 * step)
     free = np.repeat(~fixed, 3)
     squares = eigh(
@@ -81,10 +81,10 @@ def test_highest_frequency_is_the_dense_eigenvalue(held):
         np.diag(np.repeat(mass, 3)[free]),
         eigvals_only=True,
     )
-    factor = springs.factor(MESH.nodes)
+    factor = springs.factor_stiffness(MESH.nodes)
     frequency = highest_frequency(factor, mass, fixed)
     assert frequency == pytest.approx(math.sqrt(squares[-1]), rel=1e-3)
-    assert frequency**2 < 2 * (node_stiffness(factor) / mass)[~fixed].max()
+    assert frequency**2 < 2 * (bound_node_stiffness(factor) / mass)[~fixed].max()
 
 
 def observed_limit(model, guess, **chosen):
@@ -138,7 +138,7 @@ def test_beyond_the_limit_the_last_good_state_is_kept_and_it_is_said():
 
 def test_masses_are_scaled_where_needed_and_it_is_said():
     model = block((4, 3, 3))
-    factor = springs_of(MESH, uniform_material(MESH, SOFT)).factor(MESH.nodes)
+    factor = build_springs(MESH, make_uniform_materials(MESH, SOFT)).factor_stiffness(MESH.nodes)
     mass, substeps, action = stabilise(model, factor, 0.01, 0.1, "mass_scaling", 100)
     assert substeps == 1
     assert (mass >= model.lumped_mass).all()
@@ -150,7 +150,7 @@ def test_masses_are_scaled_where_needed_and_it_is_said():
 
 def test_substeps_are_counted_or_refused():
     model = block((4, 3, 3))
-    factor = springs_of(MESH, uniform_material(MESH, SOFT)).factor(MESH.nodes)
+    factor = build_springs(MESH, make_uniform_materials(MESH, SOFT)).factor_stiffness(MESH.nodes)
     mass, substeps, action = stabilise(model, factor, 0.01, 0.1, "substeps", 100)
     np.testing.assert_array_equal(mass, model.lumped_mass)
     assert substeps > 1
@@ -164,9 +164,9 @@ def test_substeps_are_counted_or_refused():
 def test_the_residual_is_unbalanced_over_contact_force_or_the_largest_since_rest():
     residual, down = ElasticResidual(rounding=1e-12), np.array([[0.0, 0.0, 1.0]])
     elastic = np.array([[0.0, 0.1, 4.0], [0.1, 0.0, 0.0]])  # N; the probe bears 4 N on node 0
-    found = residual.residual(elastic, np.array([0]), down)
+    found = residual.compute_residual(elastic, np.array([0]), down)
     assert found == pytest.approx(math.hypot(0.1, 0.1) / 4.0)
-    released = residual.residual(elastic / 40, np.array([], int), down[:0])
+    released = residual.compute_residual(elastic / 40, np.array([], int), down[:0])
     assert released == pytest.approx(np.linalg.norm(elastic) / 40 / 4.0)
     residual.reset()
-    assert residual.residual(elastic / 40, np.array([], int), down[:0]) == 1.0
+    assert residual.compute_residual(elastic / 40, np.array([], int), down[:0]) == 1.0

@@ -15,7 +15,7 @@ def test_a_sum_is_the_product_with_the_forces(seed, surface, precision):
     random = np.random.default_rng(seed)
     exact = random.normal(size=(40, 3, 3 * surface))
     nodes = random.permutation(40)[:33]
-    made = DenseFields.compute(
+    made = DenseFields.compute_at(
         nodes,
         surface,
         lambda chosen: exact.reshape(40, 3, -1, 3)[:, :, chosen].reshape(40, 3, -1),
@@ -23,7 +23,7 @@ def test_a_sum_is_the_product_with_the_forces(seed, surface, precision):
     )
     forces = random.normal(size=3 * surface) * (random.random(3 * surface) < 0.5)
     displacement = np.ones((40, 3))
-    made.add(forces, displacement)
+    made.add_displacement(forces, displacement)
     expected = np.ones((40, 3))
     expected[nodes] += exact[nodes] @ forces
     np.testing.assert_allclose(displacement, expected, atol=1e-4)

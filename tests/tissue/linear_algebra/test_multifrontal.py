@@ -6,9 +6,9 @@ from scipy.sparse.linalg import splu
 from tissue_block import block, block_mesh, irregular
 
 from us_sim.errors import SolverError
-from us_sim.tissue.elasticity.linear_tetrahedra import averaged_pressure
+from us_sim.tissue.elasticity.linear_tetrahedra import assemble_averaged_pressure
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
+from us_sim.tissue.elasticity.materials import TissueMaterials, make_uniform_materials
 from us_sim.tissue.linear_algebra.multifrontal import eliminate
 
 
@@ -37,11 +37,13 @@ def mixed(mesh):
 def test_agrees_with_a_sparse_solver(ratio):
     mesh = block_mesh((9, 6, 7))
     model = block((9, 6, 7))
-    materials = mixed(mesh) if ratio is None else uniform_material(mesh, Material(1e4, ratio))
-    system = averaged_pressure(mesh, materials)
+    materials = mixed(mesh) if ratio is None else make_uniform_materials(mesh, Material(1e4, ratio))
+    system = assemble_averaged_pressure(mesh, materials)
     loaded = np.random.default_rng(0).permutation(model.movable_contact_nodes)[:30]
     eliminated = eliminate(mesh, system, model.fixed, loaded)
-    found = np.concatenate([eliminated.fields(loaded[:7]), eliminated.fields(loaded[7:])], axis=2)
+    found = np.concatenate(
+        [eliminated.compute_fields(loaded[:7]), eliminated.compute_fields(loaded[7:])], axis=2
+    )
 
     expected = sparse_fields(system, model.fixed, loaded)
     np.testing.assert_allclose(found, expected, atol=1e-8 * abs(expected).max())
@@ -50,9 +52,9 @@ def test_agrees_with_a_sparse_solver(ratio):
 @pytest.mark.slow
 def test_single_precision_changes_little():
     model = block((9, 6, 7))
-    system = averaged_pressure(model.mesh, model.materials)
+    system = assemble_averaged_pressure(model.mesh, model.materials)
     nodes = model.movable_contact_nodes
-    found = eliminate(model.mesh, system, model.fixed, nodes, np.float32).fields(nodes[:5])
+    found = eliminate(model.mesh, system, model.fixed, nodes, np.float32).compute_fields(nodes[:5])
     expected = sparse_fields(system, model.fixed, nodes[:5])
     np.testing.assert_allclose(found, expected, atol=1e-5 * abs(expected).max())
 
@@ -62,7 +64,9 @@ def test_constant_strain_patch(ratio):
     mesh = irregular(block_mesh((6, 5, 5)))
     gradient = np.random.default_rng(2).uniform(-0.1, 0.1, (3, 3))
     exact = (mesh.nodes @ gradient.T).ravel()
-    matrix = averaged_pressure(mesh, uniform_material(mesh, Material(10e3, ratio))).stiffness
+    matrix = assemble_averaged_pressure(
+        mesh, make_uniform_materials(mesh, Material(10e3, ratio))
+    ).stiffness
     free = np.repeat(~np.isin(np.arange(len(mesh.nodes)), mesh.boundary), 3)
     load = -(matrix[free][:, ~free] @ exact[~free])
     found = splu(matrix[free][:, free].tocsc()).solve(load)
@@ -71,7 +75,7 @@ def test_constant_strain_patch(ratio):
 
 def test_a_stiffness_that_is_not_positive_definite_is_refused():
     mesh = block_mesh((4, 4, 4))
-    system = averaged_pressure(mesh, uniform_material(mesh, Material(10e3, 0.3)))
+    system = assemble_averaged_pressure(mesh, make_uniform_materials(mesh, Material(10e3, 0.3)))
     nothing = np.zeros(len(mesh.nodes), dtype=bool)
     with pytest.raises(SolverError, match="positive definite"):
         eliminate(mesh, system, nothing, np.array([0], np.int32))

@@ -8,7 +8,7 @@ from tissue_block import block, block_mesh
 
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
+from us_sim.tissue.elasticity.materials import TissueMaterials, make_uniform_materials
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
 from us_sim.tissue.linear_algebra.sparse_factors import FactoredStiffness
 from us_sim.tissue.linear_algebra.two_level import CoarseGrid, TwoLevel, conjugate_gradients
@@ -16,7 +16,7 @@ from us_sim.tissue.linear_algebra.two_level import CoarseGrid, TwoLevel, conjuga
 NODES = (5, 4, 4)
 MESH = block_mesh(NODES)
 COUNT = len(MESH.nodes)
-MODEL = block(NODES, materials=uniform_material(MESH, Material(10e3, 0.0, 1000.0)))
+MODEL = block(NODES, materials=make_uniform_materials(MESH, Material(10e3, 0.0, 1000.0)))
 FREE = np.flatnonzero(~MODEL.fixed)
 NONE = (np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
 FACTORED = FactoredStiffness(MODEL)
@@ -31,7 +31,7 @@ def solved(factored, force):
 def test_at_rest_it_solves_a_stiffness_of_its_own_shear_and_bulk():
     # The neo-Hookean energy's slope at rest without its geometric part:
     # mu grad u : grad v + (lambda + mu) div u div v.
-    FACTORED.prepare(np.zeros((3, COUNT)), *NONE)
+    FACTORED.factor_at(np.zeros((3, COUNT)), *NONE)
     force = np.random.default_rng(0).normal(size=(3, COUNT))
     moved = solved(FACTORED, force)
     assert not moved[:, MODEL.fixed].any()
@@ -56,7 +56,7 @@ def test_it_is_symmetric_and_positive_even_where_tissue_is_inside_out(seed, size
     nodes = MODEL.movable_contact_nodes[:4].astype(np.int64)
     normals = rng.normal(size=(4, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
-    FACTORED.prepare(displacement, nodes, normals, np.full(4, firmness))
+    FACTORED.factor_at(displacement, nodes, normals, np.full(4, firmness))
     a, b = rng.normal(size=(2, 3, COUNT))
     a[:, MODEL.fixed] = b[:, MODEL.fixed] = 0.0
     to_a, to_b = solved(FACTORED, a), solved(FACTORED, b)
@@ -70,9 +70,9 @@ def test_springs_add_their_stiffness():
     normal = np.array([[0.6, 0.0, 0.8]])
     force = np.zeros((3, COUNT))
     force[:, node[0]] = normal[0]
-    FACTORED.prepare(np.zeros((3, COUNT)), *NONE)
+    FACTORED.factor_at(np.zeros((3, COUNT)), *NONE)
     soft = normal[0] @ solved(FACTORED, force)[:, node[0]]  # m/N
-    FACTORED.prepare(np.zeros((3, COUNT)), node, normal, np.array([700.0]))
+    FACTORED.factor_at(np.zeros((3, COUNT)), node, normal, np.array([700.0]))
     # In parallel to the tissue: 1 / (1 / soft + 700).
     assert normal[0] @ solved(FACTORED, force)[:, node[0]] == pytest.approx(
         soft / (1 + 700 * soft), rel=1e-9
@@ -92,8 +92,8 @@ def test_where_local_corrections_stall_it_takes_few_iterations():
     fixed = np.flatnonzero(model.fixed)
     grid = CoarseGrid(mesh, model.fixed, tissue.tangent_product, np.float64)
     local, factored = TwoLevel(grid, fixed, 1.0), FactoredStiffness(model)
-    local.prepare(tissue.diagonal_blocks(), *NONE)
-    factored.prepare(np.zeros((3, len(mesh.nodes))), *NONE)
+    local.set_matrix(tissue.diagonal_blocks(), *NONE)
+    factored.factor_at(np.zeros((3, len(mesh.nodes))), *NONE)
     force = np.zeros((3, len(mesh.nodes)))
     force[2, model.movable_contact_nodes] = 1.0
     counts = [

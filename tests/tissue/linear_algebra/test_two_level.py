@@ -48,7 +48,7 @@ def two_level(coarse, springs, dtype=np.float64, made=None):
     normals = np.array([[s[1], s[2], 1.0] for s in springs]).reshape(-1, 3)
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     stiffness = np.array([s[3] for s in springs], dtype=float)
-    made.prepare(tissue().diagonal_blocks().astype(dtype), nodes, normals, stiffness)
+    made.set_matrix(tissue().diagonal_blocks().astype(dtype), nodes, normals, stiffness)
     return made, nodes, normals, stiffness
 
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from us_sim.tissue.mesh.box_planes import (
     DesiredSpacing,
-    fitted_planes,
+    fit_planes,
     spacing_by_labels,
     spacing_under_probe,
 )
@@ -25,7 +25,7 @@ AXIS = st.builds(
 @settings(max_examples=40, deadline=None)
 @given(axes=st.tuples(AXIS, AXIS, AXIS), nodes=st.integers(27, 20_000))
 def test_planes_ascend_from_end_to_end_and_are_no_more_than_asked(axes, nodes):
-    planes = fitted_planes(axes, nodes)
+    planes = fit_planes(axes, nodes)
     assert np.prod([len(p) for p in planes]) <= nodes
     for axis, found in zip(axes, planes, strict=True):
         assert found[0] == axis.edges[0]
@@ -37,7 +37,7 @@ def test_cells_are_as_long_as_wished_where_they_are_near_to_what_is_thin():
     edges = np.linspace(0.0, 0.1, 1001)
     thin = DesiredSpacing(edges, np.where((edges[1:] > 0.05) & (edges[1:] <= 0.06), 1e-3, 1.0))
     flat = wish([1.0], 0.1)
-    planes, *_ = fitted_planes([thin, flat, flat], 3 * 3 * 60)
+    planes, *_ = fit_planes([thin, flat, flat], 3 * 3 * 60)
     steps, middles = np.diff(planes), (planes[1:] + planes[:-1]) / 2
     inside = (middles > 0.051) & (middles < 0.059)
     # Every cell has the same share of the wish, so those of one wish are of one length, and the

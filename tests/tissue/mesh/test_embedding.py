@@ -9,7 +9,7 @@ from sphere_surface import sphere
 from tissue_block import block_mesh
 
 from us_sim.errors import MeshError
-from us_sim.tissue.mesh.embedding import EmbeddedSurface, locate
+from us_sim.tissue.mesh.embedding import EmbeddedSurface, locate_points
 from us_sim.tissue.mesh.file import read_mesh
 
 MESH = block_mesh((9, 6, 6))
@@ -37,7 +37,7 @@ def test_affine_maps_of_the_tissue_are_affine_maps_of_the_surface(seed):
 def test_at_rest_the_surface_is_its_own_to_the_last_bit():
     vertices, triangles = sphere(0.04, centre=CENTRE)
     surface = EmbeddedSurface(MESH, vertices, triangles)
-    np.testing.assert_array_equal(surface.carry(MESH.nodes), vertices.astype(np.float32))
+    np.testing.assert_array_equal(surface.deform_vertices(MESH.nodes), vertices.astype(np.float32))
     np.testing.assert_array_equal(surface.triangles, triangles)
 
 
@@ -61,7 +61,7 @@ def test_volume_follows_the_tissues():
         a, b, c = np.moveaxis(points[triangles].astype(float), 1, 0)
         return np.einsum("ij,ij->", a, np.cross(b, c)) / 6
 
-    ratio = volume(surface.carry(squeezed)) / volume(surface.carry(MESH.nodes))
+    ratio = volume(surface.deform_vertices(squeezed)) / volume(surface.deform_vertices(MESH.nodes))
     assert ratio == pytest.approx(1.2 * 1.2 * 0.7, rel=1e-4)
 
 
@@ -71,7 +71,7 @@ def test_a_little_outside_is_carried_and_counted():
     surface = EmbeddedSurface(MESH, vertices, triangles)
     beyond = (np.abs(vertices[:, 1]) > 0.05 + 1e-6) | (np.abs(vertices[:, 2] - 0.05) > 0.05 + 1e-6)
     assert surface.outside == beyond.sum() > 0
-    carried = surface.carry(MESH.nodes * 1.1)
+    carried = surface.deform_vertices(MESH.nodes * 1.1)
     np.testing.assert_allclose(carried, vertices * 1.1, atol=5e-8)
 
 
@@ -79,14 +79,14 @@ def test_far_outside_is_refused_or_trimmed():
     vertices, triangles = sphere(0.09, centre=CENTRE)
     with pytest.raises(MeshError, match=r"outside .*vertex \d+ by 40"):
         EmbeddedSurface(MESH, vertices, triangles)
-    trimmed = EmbeddedSurface.trimmed(MESH, vertices, triangles)
+    trimmed = EmbeddedSurface.embed_trimmed(MESH, vertices, triangles)
     assert 0 < len(trimmed.triangles) < len(triangles)
     assert np.abs(trimmed.vertices[:, 2] - 0.05).max() < 0.05 + 0.02
     whole, kept = vertices[triangles], trimmed.vertices[trimmed.triangles]
     same = (np.abs(whole[:, None, 0] - kept[None, :5, 0]) < 1e-8).all(axis=2).any(axis=0)
     assert same.all()
     with pytest.raises(MeshError, match="outside the tissue"):
-        EmbeddedSurface.trimmed(MESH, vertices + 1.0, triangles)
+        EmbeddedSurface.embed_trimmed(MESH, vertices + 1.0, triangles)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_barycentric_coordinates_give_the_point_back(seed):
     random = np.random.default_rng(seed)
     mesh = block_mesh((5, 4, 3))
     points = random.uniform([-0.15, -0.1, -0.05], [0.15, 0.1, 0.15], (200, 3))
-    where = locate(mesh, points)
+    where = locate_points(mesh, points)
     np.testing.assert_allclose(where.weights.sum(axis=1), 1.0, atol=1e-12)
     corners = mesh.nodes[mesh.tetrahedra[where.tetrahedra]]
     np.testing.assert_allclose(np.einsum("pa,pax->px", where.weights, corners), points, atol=1e-12)
@@ -126,7 +126,7 @@ def test_points_made_inside_real_tetrahedra_are_found_in_them(shared_data):
     which = random.integers(0, len(mesh.tetrahedra), 4000)
     weights = random.dirichlet([2.0] * 4, len(which))
     points = np.einsum("pa,pax->px", weights, mesh.nodes[mesh.tetrahedra[which]])
-    where = locate(mesh, points)
+    where = locate_points(mesh, points)
     assert not where.outside.any()
     # This mesh does not overlap itself, so a point strictly inside is in one tetrahedron only.
     np.testing.assert_array_equal(where.tetrahedra, which)
@@ -139,6 +139,6 @@ def test_outside_an_organ_it_is_the_nearest_tetrahedron(shared_data, tmp_path):
     normal = np.cross(b - a, c - a)
     normal /= np.linalg.norm(normal, axis=1)[:, None]
     lifted = (a + b + c) / 3 + 1e-5 * normal
-    where = locate(mesh, lifted)
+    where = locate_points(mesh, lifted)
     np.testing.assert_allclose(where.outside, 1e-5, rtol=1e-6)
     np.testing.assert_array_equal(where.tetrahedra, mesh.boundary_tetrahedra)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from tissue_block import block_mesh
 
 from us_sim.errors import MeshError
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, repair
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, repair_mesh
 
 CORNER = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 ONE = np.array([[0, 1, 2, 3]])
@@ -109,7 +109,7 @@ def test_any_disorder_of_these_kinds_is_mended_and_counted(seed):
     idle = random.uniform(1.0, 2.0, (4, 3))
     shuffled = random.permutation(len(nodes) + 4)
     nodes = np.vstack([nodes, idle])[np.argsort(shuffled)]
-    mended, report = repair(nodes, shuffled[corners])
+    mended, report = repair_mesh(nodes, shuffled[corners])
     assert len(mended.nodes) == len(mesh.nodes)
     assert len(mended.tetrahedra) == len(mesh.tetrahedra)
     assert mended.volumes.sum() == pytest.approx(0.002)
@@ -123,7 +123,7 @@ def test_any_disorder_of_these_kinds_is_mended_and_counted(seed):
 
 def test_a_tetrahedron_whose_nodes_become_one_is_left_out():
     nodes = CORNER[[0, 1, 2, 3, 3]]
-    mesh, report = repair(nodes, [[0, 1, 2, 3], [0, 1, 3, 4]])
+    mesh, report = repair_mesh(nodes, [[0, 1, 2, 3], [0, 1, 3, 4]])
     assert len(mesh.tetrahedra) == 1
     joined, left_out = report
     assert "1 node " in joined
@@ -136,7 +136,7 @@ def test_a_tetrahedron_pulled_inside_out_is_refused():
     centre = np.flatnonzero(~np.isin(np.arange(len(nodes)), mesh.boundary))[0]
     nodes[centre] += [0.0, 0.0, 0.08]
     with pytest.raises(MeshError, match=r"same side.*repair: turned"):
-        repair(nodes, mesh.tetrahedra)
+        repair_mesh(nodes, mesh.tetrahedra)
 
 
 @pytest.mark.parametrize(
@@ -149,4 +149,4 @@ def test_a_tetrahedron_pulled_inside_out_is_refused():
 )
 def test_what_cannot_be_mended_is_refused(nodes, tetrahedra, words):
     with pytest.raises(MeshError, match=words):
-        repair(nodes, tetrahedra)
+        repair_mesh(nodes, tetrahedra)

@@ -10,12 +10,12 @@ from tissue_block import block, block_mesh
 from us_sim.errors import SolverError
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.probe_gap import push_out
-from us_sim.tissue.elasticity.linear_tetrahedra import averaged_pressure
+from us_sim.tissue.contact.probe_gap import measure_gaps
+from us_sim.tissue.elasticity.linear_tetrahedra import assemble_averaged_pressure
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
+from us_sim.tissue.elasticity.materials import TissueMaterials, make_uniform_materials
 from us_sim.tissue.linear_algebra import compliance as compliance_module
-from us_sim.tissue.linear_algebra.compliance import surface_compliance
+from us_sim.tissue.linear_algebra.compliance import compute_compliance
 from us_sim.tissue.linear_algebra.multifrontal import eliminate
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.tissue.model import TissueModel
@@ -34,7 +34,7 @@ def cache(tmp_path, monkeypatch):
 def sparse_solution(model, forces):
     """(N, 3) m, the displacement under the forces (N, 3) N at the nodes, by SuperLU."""
     free = np.repeat(~model.fixed, 3)
-    matrix = averaged_pressure(model.mesh, model.materials).stiffness[free][:, free]
+    matrix = assemble_averaged_pressure(model.mesh, model.materials).stiffness[free][:, free]
     found = np.zeros(forces.size)
     found[free] = splu(matrix.tocsc()).solve(forces.ravel()[free])
     return found.reshape(-1, 3)
@@ -42,7 +42,7 @@ def sparse_solution(model, forces):
 
 def nodal_forces(model, nodes):
     """(N, 3) N, what must act on the nodes to hold them where they are."""
-    matrix = averaged_pressure(model.mesh, model.materials).stiffness
+    matrix = assemble_averaged_pressure(model.mesh, model.materials).stiffness
     return (matrix @ (nodes - model.mesh.nodes).ravel()).reshape(-1, 3)
 
 
@@ -71,7 +71,9 @@ def test_the_field_agrees_with_an_independent_sparse_solve(monkeypatch, double):
 @pytest.mark.parametrize("ratio", [0.3, 0.49])
 def test_gaps_pushes_and_residual_are_as_they_should_be(collider, ratio):
     mesh = block_mesh((17, 9, 9))
-    model = block((17, 9, 9), collider, materials=uniform_material(mesh, Material(10e3, ratio)))
+    model = block(
+        (17, 9, 9), collider, materials=make_uniform_materials(mesh, Material(10e3, ratio))
+    )
     solver = Fem(model)
     random = np.random.default_rng(0)
     for _ in range(12):
@@ -84,7 +86,7 @@ def test_gaps_pushes_and_residual_are_as_they_should_be(collider, ratio):
         assert not deformation.action
         skirt = np.zeros(len(model.contact_nodes))
         skirt[np.isin(model.contact_nodes, touched)] = model.contact_spacing
-        gap, normal = push_out(
+        gap, normal = measure_gaps(
             collider, pose, deformation.nodes[model.contact_nodes], model.contact_spacing, skirt
         )
         pushed = np.isin(model.contact_nodes, touched)
@@ -99,7 +101,7 @@ def test_gaps_pushes_and_residual_are_as_they_should_be(collider, ratio):
         unbalanced[model.fixed] = 0.0
         checked = np.linalg.norm(unbalanced) / np.linalg.norm(along[pushed])
         assert max(checked, deformation.residual) < 1e-5
-        reaction = Pose(np.zeros(3), pose.orientation).apply(deformation.force[None])[0]
+        reaction = Pose(np.zeros(3), pose.orientation).transform_points(deformation.force[None])[0]
         np.testing.assert_allclose(reaction, force[model.fixed].sum(axis=0), atol=1e-6)
 
 
@@ -124,7 +126,7 @@ def test_force_grows_with_depth_as_hertz_says():
     near = (np.abs(mesh.nodes[:, :2]) < 4.5e-3).all(axis=1) & (mesh.nodes[:, 2] == 0)
     model = TissueModel(
         mesh,
-        uniform_material(mesh, Material(10e3, 0.3)),
+        make_uniform_materials(mesh, Material(10e3, 0.3)),
         fixed,
         Sphere(0.03),
         np.flatnonzero(near).astype(np.int32),
@@ -146,14 +148,14 @@ def test_a_cantilever_bends_as_timoshenko_says():
     for cells in (4, 8):
         width = uniform_planes(0.0, 0.02, cells + 1)
         mesh = box_mesh(uniform_planes(0.0, 0.1, 5 * cells + 1), width, width)
-        system = averaged_pressure(mesh, uniform_material(mesh, Material(10e3, 0.3)))
+        system = assemble_averaged_pressure(mesh, make_uniform_materials(mesh, Material(10e3, 0.3)))
         end = np.flatnonzero(mesh.nodes[:, 0] == 0.1).astype(np.int32)
         weight = np.ones((cells + 1, cells + 1))
         weight[[0, -1]] /= 2
         weight[:, [0, -1]] /= 2
         load = np.zeros((len(end), 3))
         load[:, 2] = weight.ravel() / weight.sum()
-        fields = eliminate(mesh, system, mesh.nodes[:, 0] == 0, end).fields(end)
+        fields = eliminate(mesh, system, mesh.nodes[:, 0] == 0, end).compute_fields(end)
         deflections.append((fields[end, 2] @ load.ravel()).mean())
     exact = 0.1**3 / (3 * 10e3 * 0.02**4 / 12) + 0.1 / (5 / 6 * 10e3 / 2.6 * 0.02**2)
     assert (4 * deflections[1] - deflections[0]) / 3 == pytest.approx(exact, rel=0.03)
@@ -175,7 +177,7 @@ def test_what_rounding_leaves_unbalanced_is_known_without_a_product(monkeypatch,
         loads[solver._reached] = solver._contact.forces
         unbalanced = (nodal_forces(model, deformation.nodes) - loads)[~model.fixed]
         error = np.linalg.norm(unbalanced) / np.linalg.norm(loads)
-        known = solver._compliance.unbalanced(solver._contact.forces)
+        known = solver._compliance.compute_imbalance(solver._contact.forces)
         assert known == pytest.approx(error, rel=0.01)
         assert deformation.residual >= known
 
@@ -184,7 +186,7 @@ def test_what_rounding_leaves_unbalanced_is_known_without_a_product(monkeypatch,
 def test_large_fields_agree_with_a_sparse_solve_and_their_error_is_sampled(monkeypatch):
     monkeypatch.setattr(compliance_module, "_LARGE", 0)
     model = block((21, 11, 11))
-    compliance = surface_compliance(model)
+    compliance = compute_compliance(model)
     deformation = Fem(model).deform(PRESSED)
     load = pushes(model, deformation)
     expected, forces = sparse_solution(model, load), load[compliance.nodes]
@@ -192,8 +194,8 @@ def test_large_fields_agree_with_a_sparse_solve_and_their_error_is_sampled(monke
     assert error.max() <= 5e-5 * np.linalg.norm(expected, axis=1).max()
 
     displacement = np.zeros((3, len(model.mesh.nodes)), np.float32)
-    compliance.add_field(forces, displacement)
-    field = compliance.field(forces)
+    compliance.add_displacement(forces, displacement)
+    field = compliance.compute_displacement(forces)
     np.testing.assert_allclose(displacement.T, field, atol=1e-6 * abs(field).max())
 
     force = nodal_forces(model, deformation.nodes)
@@ -231,7 +233,7 @@ def test_what_takes_long_is_kept_and_mended(cache, monkeypatch, caplog):
         assert computed == damaged == (str(entry) in caplog.text)
     assert (entry / "fields.npy").read_bytes() == fields
 
-    other = block((9, 5, 5), materials=uniform_material(model.mesh, Material(20e3, 0.45)))
+    other = block((9, 5, 5), materials=make_uniform_materials(model.mesh, Material(20e3, 0.45)))
     twice, computed = deformed(other)
     assert computed
     assert np.linalg.norm(twice.force) == pytest.approx(2 * np.linalg.norm(made.force))
@@ -243,7 +245,7 @@ YOUNG = 10e3  # Pa
 def settled_reaction(name, ratio):
     """N, of the block pressed by 12 mm."""
     mesh = block_mesh((20, 10, 10))
-    model = block((20, 10, 10), materials=uniform_material(mesh, Material(YOUNG, ratio)))
+    model = block((20, 10, 10), materials=make_uniform_materials(mesh, Material(YOUNG, ratio)))
     solver = create_solver(name, model)
     poses = [Pose(np.array([0.0, 0.0, z])) for z in (0.0025, 0.005, 0.0075, 0.01, 0.012)]
     for pose in poses + poses[-1:] * 200:

@@ -7,11 +7,11 @@ from scipy.sparse.linalg import spsolve
 from tissue_block import at, block, block_mesh, settle
 
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
-from us_sim.geometry.collider_distance import signed_distance
-from us_sim.tissue.contact.probe_gap import push_out
-from us_sim.tissue.elasticity.linear_tetrahedra import stiffness
+from us_sim.geometry.collider_distance import measure_distances
+from us_sim.tissue.contact.probe_gap import measure_gaps
+from us_sim.tissue.elasticity.linear_tetrahedra import assemble_stiffness
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import uniform_material
+from us_sim.tissue.elasticity.materials import make_uniform_materials
 from us_sim.tissue.solvers.fem_cg import FemCg, FemCgSettings
 
 PLATE = RoundedBox(0.5, 0.4, 0.1, 0.01)  # covers the whole block
@@ -19,7 +19,7 @@ PLATE = RoundedBox(0.5, 0.4, 0.1, 0.01)  # covers the whole block
 
 def test_uniaxial_compression_has_hookes_force_and_a_linear_field():
     spongy = Material(young_modulus=10e3, poisson_ratio=0.0, density=1000.0)
-    model = block((9, 5, 5), PLATE, materials=uniform_material(block_mesh((9, 5, 5)), spongy))
+    model = block((9, 5, 5), PLATE, materials=make_uniform_materials(block_mesh((9, 5, 5)), spongy))
     deformation = settle(FemCg(model, FemCgSettings(tolerance=1e-10)), at(x=0.01, z=0.005))
     # E A d / L = 10 kPa * 0.02 m2 * 5 mm / 100 mm
     np.testing.assert_allclose(deformation.force, [0, 0, -10], atol=1e-6)
@@ -43,13 +43,13 @@ def test_converges_to_the_direct_solution_of_its_contact_set(collider, tilt):
     # Minimise u K u / 2 with the touched nodes' normal displacements as found.
     displacement = deformation.nodes - model.mesh.nodes
     touched = deformation.contact_nodes
-    _, normal = push_out(collider, pose, deformation.nodes[touched], model.contact_spacing)
+    _, normal = measure_gaps(collider, pose, deformation.nodes[touched], model.contact_spacing)
     count = len(touched)
     rows = np.repeat(np.arange(count), 3)
     columns = (3 * touched[:, None] + np.arange(3)).ravel()
     constraint = csr_array((normal.ravel(), (rows, columns)), shape=(count, displacement.size))
     free = np.repeat(~model.fixed, 3)
-    matrix = stiffness(model.mesh, model.materials).tocsr()[free][:, free]
+    matrix = assemble_stiffness(model.mesh, model.materials).tocsr()[free][:, free]
     constraint = constraint[:, free]
     system = csc_array(bmat([[matrix, constraint.T], [constraint, None]]))
     right = np.zeros(system.shape[0])
@@ -96,7 +96,7 @@ def test_no_node_stays_inside_the_probe_and_none_is_pulled(collider):
     model = block((13, 7, 6), collider)
     deformation = settle(FemCg(model), at(z=0.015))
     reachable = deformation.nodes[model.contact_nodes]
-    distance, _ = signed_distance(collider, at(z=0.015), reachable)
+    distance, _ = measure_distances(collider, at(z=0.015), reachable)
     assert distance.min() > -2e-5
     touched = np.isin(model.contact_nodes, deformation.contact_nodes)
     assert abs(distance[touched]).max() < 2e-5

@@ -11,17 +11,21 @@ from scipy.optimize import minimize
 from tissue_block import at, block, block_mesh, pressed, require_reaction, settle
 
 from us_sim.evaluation.independent_forces import (
-    hooke_forces,
-    least_unbalanced,
-    neo_hookean_forces,
+    bound_imbalance,
+    compute_hooke_forces,
+    compute_neo_hookean_forces,
 )
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
-from us_sim.geometry.collider_distance import signed_distance
-from us_sim.scene.building import tissue_model_of, volume_of
+from us_sim.geometry.collider_distance import measure_distances
+from us_sim.scene.building import build_tissue_model, load_volume
 from us_sim.scene.reading import load_scene
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material, volumetric_split
+from us_sim.tissue.elasticity.materials import (
+    TissueMaterials,
+    make_uniform_materials,
+    volumetric_split,
+)
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
 from us_sim.tissue.linear_algebra.sparse_factors import FactoredStiffness
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
@@ -36,7 +40,7 @@ FINE = (13, 7, 6)
 
 
 def made_of(ratio, nodes=FINE, modulus=10e3):
-    return uniform_material(block_mesh(nodes), Material(modulus, ratio, 1000.0))
+    return make_uniform_materials(block_mesh(nodes), Material(modulus, ratio, 1000.0))
 
 
 def deformation_gradients(mesh, nodes):
@@ -75,9 +79,9 @@ def least_residual(model, deformation):
     """The least that the residual of returned nodes can be, and what of it may be rounding."""
 
     def forces(displacement):
-        return neo_hookean_forces(model.mesh, model.materials, displacement)
+        return compute_neo_hookean_forces(model.mesh, model.materials, displacement)
 
-    unbalanced, rounding, load = least_unbalanced(model, forces, deformation)
+    unbalanced, rounding, load = bound_imbalance(model, forces, deformation)
     return unbalanced / load, rounding / load
 
 
@@ -99,9 +103,9 @@ def test_a_press_by_a_plate_is_what_another_minimiser_finds(ratio):
     def value(flat):
         nodes = rest.copy()
         nodes[free] = flat.reshape(-1, 3)
-        return energy(model, nodes), neo_hookean_forces(model.mesh, model.materials, nodes - rest)[
-            free
-        ].ravel()
+        return energy(model, nodes), compute_neo_hookean_forces(
+            model.mesh, model.materials, nodes - rest
+        )[free].ravel()
 
     start = rest.copy()
     start[:, 2] += depth * (1 - rest[:, 2] / 0.1)
@@ -122,7 +126,7 @@ def test_a_small_press_is_that_of_linear_elasticity(ratio):
     model = block(FINE, materials=made_of(ratio))
     found = settle(FemNonlinear(model), at(z=1e-3))
     displacement = found.nodes - model.mesh.nodes
-    holding = hooke_forces(model.mesh, model.materials, displacement, averaged=True)
+    holding = compute_hooke_forces(model.mesh, model.materials, displacement, averaged=True)
     touched = np.zeros(len(holding), dtype=bool)
     touched[found.contact_nodes] = True
     load = holding[touched & ~model.fixed].sum(axis=0)
@@ -144,7 +148,7 @@ def test_a_settled_press_is_balanced_and_keeps_the_law_of_contact(collider, rati
     assert least_residual(model, deformation)[0] < 2e-5
     assert smallest_volume_ratio(model, deformation.nodes) > 0.3
     assert len(deformation.contact_nodes) > 3
-    distance, _ = signed_distance(collider, pose, deformation.nodes[model.contact_nodes])
+    distance, _ = measure_distances(collider, pose, deformation.nodes[model.contact_nodes])
     assert distance.min() > -0.1 * model.contact_spacing  # it sinks into its springs
     touched = np.isin(model.contact_nodes, deformation.contact_nodes)
     # A node away from the probe is touched where its triangles are.
@@ -432,7 +436,7 @@ def test_a_held_probe_in_balance_waits_for_no_factor_where_time_is_short(
     nearly_incompressible, monkeypatch, live, factors
 ):
     wanted = []
-    monkeypatch.setattr(FactoredStiffness, "prepare", lambda *_: wanted.append(True))
+    monkeypatch.setattr(FactoredStiffness, "factor_at", lambda *_: wanted.append(True))
     monkeypatch.setattr(newton, "TUNING", replace(TUNING, iteration_limit=1))
     monkeypatch.setattr(frame_budget, "TUNING", replace(TUNING, rest_frames=3))
     solver = made_anew(nearly_incompressible)
@@ -451,13 +455,13 @@ def test_a_held_probe_in_balance_waits_for_no_factor_where_time_is_short(
 def test_a_probe_at_rest_makes_few_factors_and_the_next_pose_none(
     nearly_incompressible, monkeypatch
 ):
-    made, prepare = [], FactoredStiffness.prepare
+    made, prepare = [], FactoredStiffness.factor_at
 
     def counted(*given):
         made.append(True)
         return prepare(*given)
 
-    monkeypatch.setattr(FactoredStiffness, "prepare", counted)
+    monkeypatch.setattr(FactoredStiffness, "factor_at", counted)
     solver = made_anew(nearly_incompressible)
     solver.frame_limit = None
     monkeypatch.setattr(newton, "TUNING", replace(TUNING, iteration_limit=1))  # all need one
@@ -515,7 +519,7 @@ def test_tissue_inside_out_is_begun_anew_at_once_only_where_time_is_short(
 def test_a_probe_that_leaps_deep_into_an_arm_is_followed_step_by_step(small_scene):
     scene = load_scene(str(small_scene))
     solver = FemNonlinear(
-        tissue_model_of(scene, volume_of(scene)), FemNonlinearSettings(most_iterations=12)
+        build_tissue_model(scene, load_volume(scene)), FemNonlinearSettings(most_iterations=12)
     )
     solver.frame_limit = 10.0  # s: live, and yet only iterations end a frame
     solver.deform(at(z=-0.01))
@@ -535,12 +539,12 @@ def test_a_probe_that_leaps_deep_into_an_arm_is_followed_step_by_step(small_scen
 def test_a_single_tetrahedron_with_one_free_corner():
     nodes = np.array([[0.05, 0, 0.1], [-0.05, 0.05, 0.1], [-0.05, -0.05, 0.1], [0, 0, 0.0]])
     mesh = TetrahedralMesh(nodes, np.array([[0, 2, 1, 3]]))
-    materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
+    materials = make_uniform_materials(mesh, Material(10e3, 0.45, 1000.0))
     fixed = nodes[:, 2] > 0.05
     model = TissueModel(mesh, materials, fixed, Sphere(0.05), np.array([3]))
     pose = at(z=0.02)
     deformation = settle(FemNonlinear(model), pose)
     assert least_residual(model, deformation)[0] < 1e-5
     # It has no neighbour to carry part of the load, so the probe sinks deep into its spring.
-    distance, _ = signed_distance(model.collider, pose, deformation.nodes[3:])
+    distance, _ = measure_distances(model.collider, pose, deformation.nodes[3:])
     assert -0.3 * 0.02 < distance[0] < 0.0

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from us_sim.tissue.solvers.fem_nonlinear import Recovery
-from us_sim.tissue.solvers.frame_budget import LEAST, PERIOD, FrameBudget, Pace
+from us_sim.tissue.solvers.fem_nonlinear import InversionRecovery
+from us_sim.tissue.solvers.frame_budget import LEAST, PERIOD, FrameBudget, FramePace
 
 IDENTITY = np.eye(3)
 
@@ -26,7 +26,7 @@ def steps_until_over(balanced_after, *, strict=None, live=None):
     """Newton steps, at 0.05 s an iteration, until a frame ends; a step is cut to end in time."""
     clock = Clock()
     budget = FrameBudget(clock)
-    budget.begin(10_000, strict, live, moved=True)
+    budget.begin_frame(10_000, strict, live, moved=True)
     for number in range(1, 101):
         budget.begin_step()
         iterations = min(12, budget.step_iterations)
@@ -62,42 +62,42 @@ def test_a_frame_ends_with_its_time_and_a_live_one_when_it_is_balanced(
 def test_load_steps_leave_time_and_iterations_for_the_pose_itself():
     clock = Clock()
     budget = FrameBudget(clock)
-    budget.begin(100, 10.0, moved=True)
+    budget.begin_frame(100, 10.0, moved=True)
     clock.now += 4.9
     assert budget.allows_load_step
     assert not budget.is_late
     clock.now += 0.2
     assert not budget.allows_load_step
     assert budget.is_late
-    budget.begin(100, moved=True)
-    budget.spend(52)  # and 8
+    budget.begin_frame(100, moved=True)
+    budget.spend_iterations(52)  # and 8
     clock.now += 1000.0
     assert budget.allows_load_step
-    budget.spend(0)
+    budget.spend_iterations(0)
     assert not budget.allows_load_step
 
 
 @pytest.mark.parametrize(("hurried", "frames"), [(True, 1), (False, 11)])
 def test_tissue_inside_out_is_begun_anew_after_its_time(hurried, frames):
-    recovery = Recovery(IDENTITY)
-    recovery.judge(2.0 * IDENTITY, True)
+    recovery = InversionRecovery(IDENTITY)
+    recovery.record_frame(2.0 * IDENTITY, True)
     count = 0
     while not recovery.must_restart(hurried=hurried):
-        recovery.judge(-IDENTITY, False)
+        recovery.record_frame(-IDENTITY, False)
         count += 1
     assert count == frames
     np.testing.assert_array_equal(recovery.upright, 2.0 * IDENTITY)
-    recovery.judge(IDENTITY, True)
+    recovery.record_frame(IDENTITY, True)
     assert not recovery.must_restart(hurried=hurried)
     np.testing.assert_array_equal(recovery.upright, IDENTITY)
 
 
 @given(st.lists(st.floats(0.0, 0.2), max_size=50), st.floats(0.0, 0.05))
 def test_no_frame_gets_more_than_the_first_nor_nothing(durations, sending):
-    pace = Pace(sending, cores=2)
+    pace = FramePace(sending, cores=2)
     first = pace.limit
     for duration in durations:
-        pace.spend(duration)
+        pace.count_frame(duration)
         assert LEAST <= pace.limit <= first
     pace.reset()
     assert pace.limit == first
@@ -106,7 +106,7 @@ def test_no_frame_gets_more_than_the_first_nor_nothing(durations, sending):
 @given(st.lists(st.floats(0.0, 1.8 * PERIOD), max_size=50), st.floats(0.0, 0.002))
 def test_frames_that_overran_are_made_up_for(wanted, sending):
     """A queue at 60 Hz, in which each other frame keeps to its limit: no pose is skipped."""
-    pace = Pace(sending, cores=2)
+    pace = FramePace(sending, cores=2)
     first, free = pace.limit, 0.0
     for k, duration in enumerate(wanted):
         waited = max(0.0, free - k * PERIOD)
@@ -114,8 +114,8 @@ def test_frames_that_overran_are_made_up_for(wanted, sending):
         if k % 2:
             duration = min(duration, pace.limit)
         free = max(free, k * PERIOD) + duration
-        pace.spend(duration)
+        pace.count_frame(duration)
     for _ in range(20):  # whatever came before
         last = pace.limit + sending
-        pace.spend(last)
+        pace.count_frame(last)
     assert last == pytest.approx(first + sending)

@@ -87,7 +87,7 @@ def test_every_step_lowers_the_energy_from_any_start_also_inside_out(name):
     def descend(pose, size, seed):
         nonlocal inverted
         newton = pressed(name, pose, size, seed)
-        inverted += newton.tissue.inverted(newton.displacement) > 0
+        inverted += newton.tissue.count_inverted(newton.displacement) > 0
         for _ in range(12):
             newton.update_relief()  # as a step begins
             energy, before = newton.energy, newton.displacement

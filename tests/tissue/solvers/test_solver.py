@@ -11,7 +11,7 @@ from us_sim.errors import SolverError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SOLVERS
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import uniform_material
+from us_sim.tissue.elasticity.materials import make_uniform_materials
 from us_sim.tissue.model import Intervention, TissueState
 from us_sim.tissue.solvers.solver import create_solver
 
@@ -198,7 +198,7 @@ def test_tissue_that_is_not_held_is_refused(name):
 @pytest.mark.parametrize("ratio", [0.2, 0.45])  # without and with averaged pressures
 @pytest.mark.parametrize("name", list(SOLVERS))
 def test_tissue_that_is_all_held_does_not_move(name, ratio):
-    materials = uniform_material(block_mesh((3, 3, 3)), Material(10e3, ratio))
+    materials = make_uniform_materials(block_mesh((3, 3, 3)), Material(10e3, ratio))
     model = replace(block((3, 3, 3), materials=materials), fixed=np.ones(27, dtype=bool))
     deformation = create_solver(name, model).deform(PRESSED)
     np.testing.assert_array_equal(deformation.nodes, model.mesh.nodes)

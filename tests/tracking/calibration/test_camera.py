@@ -18,7 +18,7 @@ CORNERS = 0.03 * np.stack([*np.indices((9, 7)), np.zeros((9, 7))], axis=-1).resh
 
 def view(turn, place, noise=0.0, rng=None):
     seen = Rotation.from_rotvec(turn).apply(CORNERS - CORNERS.mean(axis=0)) + place
-    pixels = CAMERA.project(seen)
+    pixels = CAMERA.project_points(seen)
     if rng is not None:
         pixels = pixels + noise * rng.standard_normal(pixels.shape)
     return BoardView(CORNERS.astype(np.float32), pixels.astype(np.float32))
@@ -62,7 +62,7 @@ def test_errors_are_as_large_as_the_deviations_say():
 
 @pytest.mark.slow
 def test_the_grid_boards_photos_give_a_smaller_residual_than_was_known(shared_data):
-    board = RigidBody.grid("DICT_6X6_1000", 4, 5, 0.0375, 0.005)
+    board = RigidBody.create_grid("DICT_6X6_1000", 4, 5, 0.0375, 0.005)
     files = [shared_data / "marker-aruco-gridboard" / f"{k}.jpg" for k in range(42)]
     views = [find_board(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), board) for file in files]
     # At least 19 of the 20 markers in each photo, as other programs find.
@@ -76,7 +76,7 @@ def test_the_grid_boards_photos_give_a_smaller_residual_than_was_known(shared_da
 
 
 def test_the_charuco_photos_give_the_published_camera(shared_data):
-    board = RigidBody.charuco("6X6_250", 5, 7, 0.04, 0.02)
+    board = RigidBody.create_charuco("6X6_250", 5, 7, 0.04, 0.02)
     files = [shared_data / "marker-opencv-charuco" / f"img_0{k}.jpg" for k in range(4)]
     views = [find_board(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), board) for file in files]
     assert [len(view) for view in views] == [24, 24, 24, 24]
@@ -141,7 +141,7 @@ def drawn(board):
 
 @pytest.mark.slow
 def test_half_a_board_is_enough_and_a_row_or_none_of_it_is_not():
-    board = RigidBody.charuco("4X4_50", 6, 5, 0.03, 0.02)
+    board = RigidBody.create_charuco("4X4_50", 6, 5, 0.03, 0.02)
     photo = drawn(board)
     whole, half = find_board(photo, board), find_board(photo[:, :400], board)
     assert len(whole) == 20

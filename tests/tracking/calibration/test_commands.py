@@ -84,7 +84,8 @@ def table(file, points):
 def test_landmarks_are_matched_by_name(tmp_path, capsys):
     pose = Pose([0.3, -0.2, 0.5], [0.1, 0.2, 0.3, 0.9])
     measured = {
-        name: pose.inverse().apply(np.array([point]))[0] for name, point in reversed(POINTS.items())
+        name: pose.inverse().transform_points(np.array([point]))[0]
+        for name, point in reversed(POINTS.items())
     }
     measured["elbow"] = [0, 0, 0]
     known = table(tmp_path / "known.csv", POINTS)
@@ -114,7 +115,7 @@ def test_landmarks_are_touched_in_a_recording(tmp_path):
     turns = Rotation.from_euler("x", np.array(angles)[:, None])
     pose = Pose([0.3, -0.2, 0.5], [0.1, 0.2, 0.3, 0.9])
     placed = Rotation.from_quat(pose.inverse().orientation) * turns
-    positions = pose.inverse().apply(np.array(tips, float)) - placed.apply(TIP)
+    positions = pose.inverse().transform_points(np.array(tips, float)) - placed.apply(TIP)
     recording = bag(tmp_path / "stylus.mcap", 0.05 * np.arange(len(tips)), positions, placed)
     known, tip = table(tmp_path / "known.csv", POINTS), tmp_path / "tip.yaml"
     tip.write_text(yaml.safe_dump({"position": TIP.tolist(), "orientation": [0, 0, 0, 1]}))
@@ -161,7 +162,7 @@ def board_file(tmp_path, dictionary_and_board):
 def test_camera_from_photos_of_a_board(tmp_path, capsys):
     # Rendered by a pinhole of 700 pixels, 640 × 480, from six sides.
     camera = CameraModel(640, 480, [[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
-    board = RigidBody.charuco("4X4_50", 9, 7, 0.02, 0.015)
+    board = RigidBody.create_charuco("4X4_50", 9, 7, 0.02, 0.015)
     view = RenderedView(camera, board)
     tilts = [[0.4, 0, 0], [-0.4, 0, 0], [0, 0.5, 0], [0, -0.5, 0], [0.3, 0.3, 0.2], [-0.3, 0.3, 0]]
     for k, tilt in enumerate(tilts):

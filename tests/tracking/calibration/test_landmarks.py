@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from us_sim.command.calibration import read_motion, seconds_of
+from us_sim.command.calibration import convert_stamps, read_motion
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
 from us_sim.tracking.calibration.landmarks import read_landmarks, register_landmarks
@@ -44,7 +44,7 @@ def test_it_is_scipys_rotation_and_moves_with_the_frames(pose, seed):
 def test_errors_are_as_large_as_the_deviations_and_the_fre_say():
     rng = np.random.default_rng(3)
     noise, pose = 0.4e-3, Pose([0.2, -0.1, 0.7], [0.1, 0.5, -0.2, 0.8])
-    exact = pose.inverse().apply(CORNERS)
+    exact = pose.inverse().transform_points(CORNERS)
     positions, rotations, squares, variances = [], [], [], []
     for _ in range(400):
         found = register_landmarks(exact + noise * rng.standard_normal(exact.shape), CORNERS)
@@ -165,8 +165,8 @@ def test_plus_recording_of_eight_landmarks_gives_plus_registration(shared_data):
     # (PlusDeviceSet_fCal_Sim_RecordPhantomLandmarks.xml).
     tip = np.array([0.108565, 0.00777385, 0.0025389])
     dwells = find_dwells(
-        seconds_of(motion),
-        np.array([pose.apply(tip) for pose in poses]),
+        convert_stamps(motion),
+        np.array([pose.transform_points(tip) for pose in poses]),
         np.array([pose.rotation for pose in poses]),
     )
     assert len(dwells) == len(known) == 8

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from us_sim.geometry.pose import Pose
-from us_sim.tracking.camera.markers import square
+from us_sim.tracking.camera.markers import compute_square_corners
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rigid_body import RigidBody
 
@@ -22,7 +22,9 @@ def faceted_grip(count: int = 4, size: float = 0.03) -> RigidBody:
         x, y = 2.0 * (k % 2) - 1, 2.0 * (k // 2) - (rows - 1)
         facet = turned([0, 1, 0], 0.4 * x) @ turned([1, 0, 0], -0.3 * y)
         place = [0.02 * x, 0.02 * y, -0.008 * abs(y)]
-        corners.append(Pose(place, facet.orientation).apply(square(size)))
+        corners.append(
+            Pose(place, facet.orientation).transform_points(compute_square_corners(size))
+        )
     return RigidBody("4X4_50", np.arange(count), np.array(corners))
 
 

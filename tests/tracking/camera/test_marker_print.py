@@ -10,7 +10,7 @@ from us_sim.command.main import main
 from us_sim.errors import TrackingError
 from us_sim.share import shared_path
 from us_sim.tracking.camera.fiducial_detector import FiducialDetector
-from us_sim.tracking.camera.marker_print import print_markers, sheets
+from us_sim.tracking.camera.marker_print import lay_out_sheets, print_markers
 from us_sim.tracking.camera.rigid_body import RigidBody
 
 
@@ -26,18 +26,18 @@ def dots_per_metre(path):
 @pytest.mark.parametrize(
     "body",
     [
-        RigidBody.single("APRILTAG_36h11", 7, 0.04),
-        RigidBody.grid("6X6_1000", 4, 5, 0.0375, 0.005),
-        RigidBody.charuco("6X6_250", 5, 7, 0.03, 0.015),
-        RigidBody.charuco("5X5_250", 6, 8, 0.025, 0.018),
-        RigidBody.charuco("5X5_250", 6, 8, 0.025, 0.018, legacy=True),
+        RigidBody.create_single("APRILTAG_36h11", 7, 0.04),
+        RigidBody.create_grid("6X6_1000", 4, 5, 0.0375, 0.005),
+        RigidBody.create_charuco("6X6_250", 5, 7, 0.03, 0.015),
+        RigidBody.create_charuco("5X5_250", 6, 8, 0.025, 0.018),
+        RigidBody.create_charuco("5X5_250", 6, 8, 0.025, 0.018, legacy=True),
     ],
 )
 def test_a_printed_body_has_its_size(body, tmp_path):
     path = tmp_path / "sheet.png"
     print_markers(body, path)
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    points, pixels, _ = FiducialDetector(body).detect(image).correspondences(body)
+    points, pixels, _ = FiducialDetector(body).detect_markers(image).match_points(body)
     wanted = len(body.ids) * 4 if body.chessboard is None else len(body.chessboard.corners)
     assert len(points) == wanted
     printed = pixels / dots_per_metre(path)
@@ -48,9 +48,9 @@ def test_a_printed_body_has_its_size(body, tmp_path):
 
 
 def test_markers_of_a_body_that_is_not_flat_are_printed_one_by_one():
-    corners = np.concatenate([RigidBody.single("4X4_50", 0, 0.05).corners] * 20)
+    corners = np.concatenate([RigidBody.create_single("4X4_50", 0, 0.05).corners] * 20)
     corners += np.arange(20.0)[:, None, None] * [0.0, 0.0, 0.01]
-    pages = sheets(RigidBody("4X4_50", np.arange(20), corners))
+    pages = lay_out_sheets(RigidBody("4X4_50", np.arange(20), corners))
     # With their margins two of 66.7 mm go beside each other, and three of these rows on a sheet.
     numbers = [list(range(first, min(first + 6, 20))) for first in (0, 6, 12, 18)]
     assert [[int(text) for *_, text in page.labels] for page in pages] == numbers
@@ -61,17 +61,17 @@ def test_markers_of_a_body_that_is_not_flat_are_printed_one_by_one():
 
 def test_a_pdf_has_the_papers_size_and_the_markers_as_outlines(tmp_path):
     path = tmp_path / "sheet.pdf"
-    print_markers(RigidBody.single("4X4_50", 7, 0.04), path, "letter")
+    print_markers(RigidBody.create_single("4X4_50", 7, 0.04), path, "letter")
     content = path.read_bytes()
     assert b"/MediaBox [ 0 0 612 792 ]" in content
     assert b"/Subtype /Image" not in content
 
 
 def test_nothing_is_overwritten_and_what_cannot_be_is_said(tmp_path):
-    marker = RigidBody.single("4X4_50", 7, 0.04)
+    marker = RigidBody.create_single("4X4_50", 7, 0.04)
     path = tmp_path / "sheet.png"
     path.write_bytes(b"kept")
-    large = RigidBody.grid("4X4_50", 5, 7, 0.04, 0.01)
+    large = RigidBody.create_grid("4X4_50", 5, 7, 0.04, 0.01)
     for body, name, paper, word in (
         (marker, "sheet.png", "A4", "exists"),
         (marker, "sheet.jpg", "A4", ".pdf"),

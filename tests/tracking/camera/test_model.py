@@ -40,18 +40,20 @@ def points():
 
 @pytest.mark.parametrize("model", LENSES)
 def test_points_are_where_opencv_sees_them(model, points):
-    assert np.allclose(camera(model).project(points), opencv_pixels(model, points), atol=1e-9)
+    assert np.allclose(
+        camera(model).project_points(points), opencv_pixels(model, points), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("model", LENSES)
 def test_the_derivatives_are_those_of_the_pixels(model, points):
     shift = np.array([0.1, -0.05, 0.2])
-    slopes = camera(model).linearise(points, shift)[1]
+    slopes = camera(model).linearise_projection(points, shift)[1]
     for axis, step in enumerate(1e-6 * np.eye(3)):
-        sides = [camera(model).project(points + shift + sign * step) for sign in (1, -1)]
+        sides = [camera(model).project_points(points + shift + sign * step) for sign in (1, -1)]
         assert np.allclose(slopes[:, axis], (sides[0] - sides[1]).ravel() / 2e-6, atol=1e-5)
         turns = [cv2.Rodrigues(sign * step)[0] for sign in (1, -1)]
-        sides = [camera(model).project(points @ turn.T + shift) for turn in turns]
+        sides = [camera(model).project_points(points @ turn.T + shift) for turn in turns]
         assert np.allclose(slopes[:, 3 + axis], (sides[0] - sides[1]).ravel() / 2e-6, atol=1e-5)
 
 
@@ -60,16 +62,16 @@ def test_the_derivatives_are_those_of_the_pixels(model, points):
     st.sampled_from(sorted(LENSES)), st.floats(-0.5, 0.5), st.floats(-0.4, 0.4), st.floats(0.1, 9)
 )
 def test_the_ray_of_a_pixel_leads_back_to_the_point(model, x, y, depth):
-    pixel = camera(model).project(np.array([[x * depth, y * depth, depth]]))
-    assert np.allclose(camera(model).rays(pixel), [[x, y]], atol=1e-9)
+    pixel = camera(model).project_points(np.array([[x * depth, y * depth, depth]]))
+    assert np.allclose(camera(model).compute_rays(pixel), [[x, y]], atol=1e-9)
 
 
 def test_what_is_behind_the_camera_or_beyond_its_lens_is_nowhere():
-    assert np.isnan(camera("plumb_bob").project(np.array([[0.0, 0.0, -1.0]]))).all()
+    assert np.isnan(camera("plumb_bob").project_points(np.array([[0.0, 0.0, -1.0]]))).all()
     # With k1 = -0.3 alone radii grow up to 1 / sqrt(0.9), where they are 0.703.
     folded = camera("plumb_bob", [-0.3, 0, 0, 0])
-    assert np.isfinite(folded.rays(np.array([[320 + 600 * 0.70, 240.0]]))).all()
-    assert np.isnan(folded.rays(np.array([[320 + 600 * 0.71, 240.0]]))).all()
+    assert np.isfinite(folded.compute_rays(np.array([[320 + 600 * 0.70, 240.0]]))).all()
+    assert np.isnan(folded.compute_rays(np.array([[320 + 600 * 0.71, 240.0]]))).all()
 
 
 @pytest.mark.parametrize("model", LENSES)

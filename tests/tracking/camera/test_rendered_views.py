@@ -21,7 +21,7 @@ def camera():
 
 @pytest.mark.parametrize("turn", [[0.4, -0.2, 0.3], [-0.1, 0.5, -2.0]])
 def test_corners_are_where_opencv_projects_them(camera, turn):
-    body = RigidBody.charuco("4X4_50", 5, 4, 0.024, 0.012)  # no marker near a corner
+    body = RigidBody.create_charuco("4X4_50", 5, 4, 0.024, 0.012)  # no marker near a corner
     rotation, _ = cv2.Rodrigues(np.array(turn))
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, [0.01, -0.02, 0.35]
@@ -42,7 +42,7 @@ def test_corners_are_where_opencv_projects_them(camera, turn):
 
 def test_the_black_of_a_marker_covers_its_projected_area():
     camera = CameraModel(200, 200, [[500, 0, 99.6], [0, 500, 98.9], [0, 0, 1]])
-    body = RigidBody.single("4X4_50", 7, 0.04)
+    body = RigidBody.create_single("4X4_50", 7, 0.04)
     view = RenderedView(camera, body)
     code = cv2.aruco.generateImageMarker(
         cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 6
@@ -50,8 +50,10 @@ def test_the_black_of_a_marker_covers_its_projected_area():
     tilted = Pose([0.003, 0.001, 0.4], [np.cos(0.3), 0.0, np.sin(0.3), 0.0])
     for pose in (Pose([0.0, 0.0, 0.4], FACING), tilted):
         image = view.render(pose, SHARP)[50:150, 50:150].astype(float)
-        corners = camera.project(pose.apply(body.corners[0])).astype(np.float32)
-        margin = camera.project(pose.apply(body.corners[0] * 8 / 6)).astype(np.float32)
+        corners = camera.project_points(pose.transform_points(body.corners[0])).astype(np.float32)
+        margin = camera.project_points(pose.transform_points(body.corners[0] * 8 / 6)).astype(
+            np.float32
+        )
         # Within the white margin there are two greys only, so their mean tells the black area.
         inside = cv2.fillConvexPoly(
             np.zeros((200, 200)), np.int32(np.round(0.97 * margin + 0.03 * margin.mean(0))), 1

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from us_sim.errors import TrackingError
-from us_sim.tracking.camera.markers import dictionary
+from us_sim.tracking.camera.markers import load_dictionary
 from us_sim.tracking.camera.rigid_body import RigidBody, read_rigid_body
 
 
 def test_boards_are_where_opencv_has_them():
-    board = cv2.aruco.GridBoard((4, 5), 0.0375, 0.005, dictionary("6X6_1000"))
-    ours = RigidBody.grid("6X6_1000", columns=4, rows=5, size=0.0375, separation=0.005)
+    board = cv2.aruco.GridBoard((4, 5), 0.0375, 0.005, load_dictionary("6X6_1000"))
+    ours = RigidBody.create_grid("6X6_1000", columns=4, rows=5, size=0.0375, separation=0.005)
     assert np.allclose(ours.corners, np.array(board.getObjPoints()), atol=1e-7)
     assert np.array_equal(ours.ids, np.ravel(board.getIds()))
 
@@ -19,10 +19,10 @@ def test_boards_are_where_opencv_has_them():
 @pytest.mark.parametrize(
     ("make", "arguments", "word"),
     [
-        (RigidBody.single, ("4X4_50", 50, 0.04), "0 to 49"),
-        (RigidBody.single, ("8X8_50", 0, 0.04), "4X4_50"),
-        (RigidBody.grid, ("4X4_50", 8, 7, 0.04, 0.01), "50"),
-        (RigidBody.charuco, ("4X4_50", 5, 7, 0.02, 0.04), "smaller"),
+        (RigidBody.create_single, ("4X4_50", 50, 0.04), "0 to 49"),
+        (RigidBody.create_single, ("8X8_50", 0, 0.04), "4X4_50"),
+        (RigidBody.create_grid, ("4X4_50", 8, 7, 0.04, 0.01), "50"),
+        (RigidBody.create_charuco, ("4X4_50", 5, 7, 0.02, 0.04), "smaller"),
     ],
 )
 def test_an_impossible_body_is_refused(make, arguments, word):

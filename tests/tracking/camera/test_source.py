@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
 from us_sim.tracking.camera.body_pose import rotation_angle
-from us_sim.tracking.camera.corner_refinement import refined_corners
+from us_sim.tracking.camera.corner_refinement import refine_corners
 from us_sim.tracking.camera.encodings import decode_image
 from us_sim.tracking.camera.fiducial_detector import FiducialDetector
 from us_sim.tracking.camera.model import CameraModel
@@ -21,7 +21,7 @@ from us_sim.tracking.settings import CameraSettings
 
 FRAME = 33_000_000  # ns
 ORDINARY = Conditions()
-MARKER = RigidBody.single("4X4_50", 7, 0.04)
+MARKER = RigidBody.create_single("4X4_50", 7, 0.04)
 FACING = Pose([0.01, -0.02, 0.4], [1.0, 0.15, 0.1, 0.0])
 
 
@@ -40,7 +40,7 @@ def errors(body, views, conditions=ORDINARY):
     scene = RenderedView(WEBCAM, body)
     found = []
     for true in views:
-        seen = CameraSource(WEBCAM, body).measure(scene.render(true, conditions), 0)
+        seen = CameraSource(WEBCAM, body).measure_pose(scene.render(true, conditions), 0)
         if seen is not None:
             shift = np.linalg.norm(seen.pose.position - true.position)
             found.append([1e3 * shift, np.degrees(rotation_angle(seen.pose, true))])
@@ -69,15 +69,15 @@ def test_a_wide_lens_is_seen_through():
     grip = faceted_grip()
     true = Pose([0.15, 0.05, 0.2], [1.0, 0.1, -0.3, 0.0])  # 38 degrees from the axis
     image = RenderedView(fisheye, grip).render(true, ORDINARY)
-    seen = CameraSource(fisheye, grip).measure(image, 0)
+    seen = CameraSource(fisheye, grip).measure_pose(image, 0)
     assert np.linalg.norm(seen.pose.position - true.position) < 0.5e-3
 
 
 def test_a_charuco_board_is_measured_by_its_chessboard():
-    board = RigidBody.charuco("6X6_250", 5, 7, 0.03, 0.018)
+    board = RigidBody.create_charuco("6X6_250", 5, 7, 0.03, 0.018)
     true = Pose([-0.06, -0.1, 0.35], turned([1, 0, 0], 0.4).orientation)
     source = CameraSource(WEBCAM, board)
-    seen = source.measure(RenderedView(WEBCAM, board).render(true, ORDINARY), 0)
+    seen = source.measure_pose(RenderedView(WEBCAM, board).render(true, ORDINARY), 0)
     assert np.linalg.norm(seen.pose.position - true.position) < 1e-3
     assert np.degrees(rotation_angle(seen.pose, true)) < 0.3
     assert source.seen == 17
@@ -91,11 +91,11 @@ def test_a_moving_marker_is_followed_and_found_again(scene):
     ]
     for k, pose in enumerate(true):
         # Between two images it may leave the window around where it was.
-        seen = source.measure(scene.render(pose, ORDINARY), k * FRAME)
+        seen = source.measure_pose(scene.render(pose, ORDINARY), k * FRAME)
         assert np.linalg.norm(seen.pose.position - pose.position) < 1.5e-3
     away = np.full((480, 640), 150, np.uint8)
-    assert source.measure(away, 12 * FRAME) is None
-    assert source.measure(scene.render(true[0], ORDINARY), 13 * FRAME) is not None
+    assert source.measure_pose(away, 12 * FRAME) is None
+    assert source.measure_pose(scene.render(true[0], ORDINARY), 13 * FRAME) is not None
 
 
 @pytest.mark.slow
@@ -105,13 +105,13 @@ def test_a_large_image_is_searched_at_its_full_resolution_where_need_be():
     for distance in (0.3, 2.2):  # 240 pixels, and 33
         true = Pose([0.05, 0.02, distance], FACING.orientation)
         source = CameraSource(camera, MARKER)
-        seen = source.measure(scene.render(true, ORDINARY), 0)
+        seen = source.measure_pose(scene.render(true, ORDINARY), 0)
         assert np.linalg.norm(seen.pose.position - true.position) < 0.01 * distance
 
 
 def refused(image, word, body=MARKER, **settings):
     source = CameraSource(WEBCAM, body, CameraSettings(**settings))
-    assert source.measure(image, 0) is None
+    assert source.measure_pose(image, 0) is None
     assert word in source.last_problem
     assert source.seen == 0
 
@@ -119,7 +119,7 @@ def refused(image, word, body=MARKER, **settings):
 def test_images_without_the_marker_say_what_is_there(image):
     refused(np.zeros((480, 640), np.uint8), "black")
     refused(np.full((480, 640), 200, np.uint8), "4X4_50")
-    refused(image, "lacks (7)", RigidBody.single("4X4_50", 8, 0.04))
+    refused(image, "lacks (7)", RigidBody.create_single("4X4_50", 8, 0.04))
 
 
 def test_what_the_marker_cannot_be_measured_by_is_refused(scene, image):
@@ -140,7 +140,7 @@ def test_a_wrong_size_of_one_of_three_markers_is_left_out():
     wrong = grip.corners.copy()
     wrong[2] += [0.01, 0.0, 0.0]
     source = CameraSource(WEBCAM, RigidBody("4X4_50", grip.ids, wrong))
-    seen = source.measure(image, 0)
+    seen = source.measure_pose(image, 0)
     assert "marker 2 is" in source.last_problem
     assert source.seen == 3
     assert np.linalg.norm(seen.pose.position - FACING.position) < 1e-3
@@ -157,24 +157,24 @@ def test_a_body_that_is_not_as_its_file_says_is_refused():
 def test_an_image_of_another_camera_is_refused(image):
     source = CameraSource(WEBCAM, MARKER)
     with pytest.raises(TrackingError, match="320 × 240"):
-        source.measure(image[:240, :320], 0)
+        source.measure_pose(image[:240, :320], 0)
     with pytest.raises(TrackingError, match="grey"):
-        source.measure(image.astype(np.float32), 0)
+        source.measure_pose(image.astype(np.float32), 0)
 
 
 def test_a_covered_edge_is_not_guessed(image):
-    corners = FiducialDetector(MARKER).detect(image).corners[0]
+    corners = FiducialDetector(MARKER).detect_markers(image).corners[0]
     x, y = (0.5 * (corners[0] + corners[1])).astype(int)
     covered = image.copy()
     covered[y - 12 : y + 12, x - 12 : x + 12] = 90
-    assert refined_corners(covered, corners, cells=6) is None
+    assert refine_corners(covered, corners, cells=6) is None
 
 
 def test_corners_are_exact_to_a_tenth_of_a_pixel(scene):
     for true in random_views(10, 0.4, (0.0, 60.0), seed=9):
-        seen = FiducialDetector(MARKER).detect(scene.render(true, ORDINARY))
-        points, pixels, _ = seen.correspondences(MARKER)
-        assert np.abs(pixels - WEBCAM.project(true.apply(points))).max() < 0.1
+        seen = FiducialDetector(MARKER).detect_markers(scene.render(true, ORDINARY))
+        points, pixels, _ = seen.match_points(MARKER)
+        assert np.abs(pixels - WEBCAM.project_points(true.transform_points(points))).max() < 0.1
 
 
 @pytest.mark.slow
@@ -183,7 +183,7 @@ def test_corners_are_exact_to_a_tenth_of_a_pixel(scene):
     [
         # With plain detections it is 0.918 pixels, with OpenCV's refined corners 0.457.
         (
-            RigidBody.grid("6X6_1000", 4, 5, 0.0375, 0.005),
+            RigidBody.create_grid("6X6_1000", 4, 5, 0.0375, 0.005),
             "marker-aruco-gridboard/*.jpg",
             42,
             range(4 * 19, 4 * 20 + 1),
@@ -191,7 +191,7 @@ def test_corners_are_exact_to_a_tenth_of_a_pixel(scene):
         ),
         # OpenCV's corners give 0.188 pixels, and 0.182 is published.
         (
-            RigidBody.charuco("6X6_250", 5, 7, 0.04, 0.02),
+            RigidBody.create_charuco("6X6_250", 5, 7, 0.04, 0.02),
             "marker-opencv-charuco/img_0[0-3].jpg",
             4,
             [24],
@@ -206,7 +206,9 @@ def test_every_photo_of_a_board_shows_its_corners(
     files = sorted(shared_data.glob(photos))
     assert len(files) == count
     images = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]
-    seen = [FiducialDetector(board).detect(image).correspondences(board)[:2] for image in images]
+    seen = [
+        FiducialDetector(board).detect_markers(image).match_points(board)[:2] for image in images
+    ]
     assert all(len(points) in corners for points, _ in seen)
     points, pixels = ([np.float32(each) for each in part] for part in zip(*seen, strict=True))
     assert cv2.calibrateCamera(points, pixels, (640, 480), None, None)[0] < residual
@@ -214,13 +216,13 @@ def test_every_photo_of_a_board_shows_its_corners(
 
 def test_a_chessboard_is_measured_where_its_markers_are_too_small():
     # Markers of 12 pixels have edges that blur into each other; the squares' crossings do not.
-    board = RigidBody.charuco("4X4_50", 5, 4, 0.024, 0.018)
+    board = RigidBody.create_charuco("4X4_50", 5, 4, 0.024, 0.018)
     scene = RenderedView(WEBCAM, board)
     middle = Pose(-np.array([0.06, 0.048, 0.0]))
     off = []
     for view in random_views(8, 0.9, (30.0, 30.0), seed=3):
         true = view @ turned([1, 0, 0], np.pi) @ middle
-        seen = CameraSource(WEBCAM, board).measure(scene.render(true, ORDINARY), 0)
+        seen = CameraSource(WEBCAM, board).measure_pose(scene.render(true, ORDINARY), 0)
         if seen is not None:
             off.append(np.degrees(rotation_angle(seen.pose, true)))
             # OpenCV 4 finds the board in one more view, by few markers; the covariance says so.
@@ -233,7 +235,7 @@ def test_a_chessboard_is_measured_where_its_markers_are_too_small():
 @pytest.mark.parametrize(
     ("video", "body", "least"),
     [
-        ("output.avi", RigidBody.single("4X4_50", 0, 0.033), 1),
+        ("output.avi", RigidBody.create_single("4X4_50", 0, 0.033), 1),
         ("multipattern.avi", "pointer.txt", 5),
         ("multipattern.avi", "reference.txt", 8),
     ],
@@ -251,7 +253,7 @@ def test_webcam_videos_are_tracked_in_every_frame(video, body, least, shared_dat
         more, frame = frames.read()
         if not more:
             break
-        seen = source.measure(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), count * FRAME)
+        seen = source.measure_pose(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), count * FRAME)
         assert seen is not None, source.last_problem
         assert source.seen >= least
         if before is not None:
@@ -263,7 +265,7 @@ def test_webcam_videos_are_tracked_in_every_frame(video, body, least, shared_dat
 
 def tag_poses(folder):
     """Where each recording of a folder has tag 13, m."""
-    tag, found = RigidBody.single("APRILTAG_36h11", 13, 0.127), {}
+    tag, found = RigidBody.create_single("APRILTAG_36h11", 13, 0.127), {}
     for file in sorted(folder.glob("*.mcap")):
         with AnyReader([file], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
             sent = {
@@ -271,7 +273,7 @@ def tag_poses(folder):
             }
         info, image = sent["/camera/camera_info"], sent["/camera/image_raw"]
         camera = CameraModel(info.width, info.height, info.k, info.d, info.distortion_model)
-        seen = CameraSource(camera, tag).measure(decode_image(image, "GRAY"), 0)
+        seen = CameraSource(camera, tag).measure_pose(decode_image(image, "GRAY"), 0)
         found[file.name[:2]] = seen.pose.position
     return found
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from us_sim.geometry.transducer import ProbeSettings
-from us_sim.settings.reading import Reader
+from us_sim.settings.reading import SettingsReader
 from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.writing import write_labels, write_volume
 from us_sim.volume.volume import Volume
 
-PROBE = Reader("probe").read(ProbeSettings, {"aperture": "30 mm", "depth": "40 mm"})
+PROBE = SettingsReader("probe").read(ProbeSettings, {"aperture": "30 mm", "depth": "40 mm"})
 
 
 @pytest.fixture(scope="session")

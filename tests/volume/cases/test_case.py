@@ -9,9 +9,9 @@ import pytest
 
 from us_sim.errors import CaseError
 from us_sim.geometry.transducer import ProbeSettings
-from us_sim.settings.reading import Reader
+from us_sim.settings.reading import SettingsReader
 from us_sim.tissue.elasticity.material import Material
-from us_sim.volume.cases.case import case_roots, find_case, read_case
+from us_sim.volume.cases.case import find_case, list_case_roots, read_case
 from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.files.writing import write_labels
 from us_sim.volume.volume import Volume
@@ -24,7 +24,7 @@ def test_a_case_is_read_as_it_was_made(make_case, block):
         "block",
         "forearm",
         "A block: 60 × 40 × 50 mm",
-        Reader("probe").read(ProbeSettings, probe),
+        SettingsReader("probe").read(ProbeSettings, probe),
         CaseStart((0.01, 0, 0), (0.0, 1.0, 0.0, 0.0)),
         7e-3,
         Material(5e3, 0.49),
@@ -33,7 +33,7 @@ def test_a_case_is_read_as_it_was_made(make_case, block):
     )
     case = read_case(make_case(settings=made))
     assert case.settings == made
-    volume = case.volume()
+    volume = case.read_volume()
     np.testing.assert_array_equal(volume.intensities, block.intensities)
     np.testing.assert_array_equal(volume.labels, block.labels)
     np.testing.assert_allclose(volume.index_to_patient, block.index_to_patient, atol=1e-15)
@@ -74,16 +74,16 @@ def test_labels_must_be_on_the_volumes_grid(make_case, block, shift, end, messag
     labels = block.labels[:, :, :end]
     write_labels(folder / "labels.nrrd", Volume(labels, placed, labels))
     with pytest.raises(CaseError, match=message):
-        read_case(folder).volume()
+        read_case(folder).read_volume()
 
 
 def test_every_label_is_a_structure_and_every_structure_is_there(make_case):
     folder = changed(make_case(), "name: a\n")
     with pytest.raises(CaseError, match="label 6"):
-        read_case(folder).volume()
+        read_case(folder).read_volume()
     changed(folder, "name: a\nstructures: {vein: {label: 6}, artery: {label: 7}}\n")
     with pytest.raises(CaseError, match=r"structures.artery: label 7"):
-        read_case(folder).volume()
+        read_case(folder).read_volume()
 
 
 def test_bones_and_the_bottom_are_held_unless_the_case_says_other():
@@ -106,14 +106,14 @@ def roots(tmp_path, make_case, monkeypatch):
 
 
 def test_a_name_is_looked_up_in_each_root_in_order_and_a_path_goes_first(roots, monkeypatch):
-    assert case_roots() == roots
+    assert list_case_roots() == roots
     for name, case in (("arm", 0), ("two/arm", 1), (roots[1] / "arm", 1)):
         assert find_case(name) == roots[case] / "arm"
     assert find_case("liver") == roots[1] / "liver"
     assert find_case("arm", [roots[1]]) == roots[1] / "arm"
     monkeypatch.delenv("US_SIM_CASES")
     monkeypatch.setenv("XDG_DATA_HOME", "/home/me/data")
-    assert case_roots() == [Path("/home/me/data/us_sim/cases")]
+    assert list_case_roots() == [Path("/home/me/data/us_sim/cases")]
 
 
 @pytest.mark.parametrize(

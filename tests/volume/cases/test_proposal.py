@@ -8,13 +8,13 @@ import pytest
 from us_sim.errors import CaseError
 from us_sim.geometry.pose import Placement, Pose
 from us_sim.geometry.transducer import ProbeSettings
-from us_sim.settings.choice import Chosen
+from us_sim.settings.choice import ChosenOption
 from us_sim.settings.registry import PROBES
-from us_sim.volume.cases.proposal import on_skin, with_proposal
+from us_sim.volume.cases.proposal import complete_settings, on_skin
 from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.volume import Volume
 
-linear = PROBES.settings("linear")
+linear = PROBES.load_settings("linear")
 VEIN = {"vein": CaseStructure(3)}
 
 
@@ -38,21 +38,21 @@ def scanned_block(vein_at: float = 0.004) -> Volume:
 def test_a_start_is_a_pose_that_was_scanned_where_these_are_known():
     volume = scanned_block()
     poses = tuple(Placement((0.0, float(y), 0.01)) for y in np.linspace(-0.02, 0.02, 11))
-    plain = with_proposal(CaseSettings("a", scanned=poses), volume)
+    plain = complete_settings(CaseSettings("a", scanned=poses), volume)
     assert plain.start.proposed
     assert plain.start.position == (0.0, 0.0, 0.01)
-    seen = with_proposal(CaseSettings("a", scanned=poses, structures=VEIN), volume)
+    seen = complete_settings(CaseSettings("a", scanned=poses, structures=VEIN), volume)
     assert seen.start.position == (0.0, 0.0, 0.01)  # it slides by 8 mm, and the vein is midway
     far = tuple(Placement((0.0, p.position[1] + 0.02, 0.01)) for p in poses)
-    moved = with_proposal(CaseSettings("a", scanned=far, structures=VEIN), volume)
+    moved = complete_settings(CaseSettings("a", scanned=far, structures=VEIN), volume)
     assert moved.start.position == (0.0, 0.004, 0.01)  # the first that is not the sweep's end
     said = CaseStart((0.01, 0.0, 0.0))
     fixed = CaseSettings("a", start=said, scanned=poses, structures=VEIN)
-    assert with_proposal(fixed, volume).start == said
+    assert complete_settings(fixed, volume).start == said
 
 
 def test_without_poses_a_linear_array_looks_along_the_columns_of_the_images():
-    made = with_proposal(CaseSettings("a"), scanned_block())
+    made = complete_settings(CaseSettings("a"), scanned_block())
     pose, array = made.start.pose, made.probe.array.given
     np.testing.assert_allclose(pose.position, [-0.001, -0.001, 0.010], atol=1e-3)
     np.testing.assert_allclose(pose.rotation[:, [0, 2]], np.eye(3)[:, [0, 2]], atol=1e-9)
@@ -83,7 +83,7 @@ def skin_under(start: Placement, volume: Volume, half: float) -> float:
     x = np.linspace(-half, half, 51)
     nearest = []
     for depth in np.arange(-0.03, 0.03, 2e-4):
-        points = start.pose.apply(np.column_stack([x, 0 * x, 0 * x + depth]))
+        points = start.pose.transform_points(np.column_stack([x, 0 * x, 0 * x + depth]))
         index = np.rint(points @ volume.patient_to_index[:3, :3].T + volume.patient_to_index[:3, 3])
         kept = ((index >= 0) & (index < volume.shape)).all(axis=1)
         seen = volume.intensities[tuple(index[kept].astype(int).T)] == 90
@@ -95,9 +95,9 @@ def skin_under(start: Placement, volume: Volume, half: float) -> float:
 @pytest.mark.parametrize("bend", [0.0, 0.004, 0.01, -0.008])
 def test_the_face_touches_skin_that_is_curved(bend):
     volume = curved_block(bend)
-    probe = ProbeSettings(Chosen("linear", linear(aperture=0.03, depth=0.03)))
+    probe = ProbeSettings(ChosenOption("linear", linear(aperture=0.03, depth=0.03)))
     for said in ({}, {"probe": probe}):
-        made = with_proposal(CaseSettings("a", **said), volume)
+        made = complete_settings(CaseSettings("a", **said), volume)
         half = made.probe.array.given.aperture / 2
         assert skin_under(made.start, volume, half) == pytest.approx(0.0, abs=1.0)  # a voxel
 
@@ -109,10 +109,12 @@ def test_a_pose_above_or_inside_is_put_on_the_skin_along_its_own_axis(depth):
     volume = replace(volume, index_to_patient=turn.matrix @ volume.index_to_patient)
     start = turn @ Pose([0.0, 0.0, depth])
     moved = on_skin(Placement(tuple(start.position), tuple(start.orientation)), volume, None)
-    np.testing.assert_allclose(moved.position, turn.apply(np.array([[0, 0, 0.0195]]))[0], atol=5e-4)
+    np.testing.assert_allclose(
+        moved.position, turn.transform_points(np.array([[0, 0, 0.0195]]))[0], atol=5e-4
+    )
 
 
 def test_where_nothing_was_scanned_nothing_is_proposed():
     black = Volume(np.zeros((4, 4, 4), np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
     with pytest.raises(CaseError, match="are 0"):
-        with_proposal(CaseSettings("a"), black)
+        complete_settings(CaseSettings("a"), black)

@@ -8,7 +8,7 @@ from made_dicom import US_MULTI_FRAME, enhanced, header, item, turned, write
 from us_sim.command.main import main
 from us_sim.errors import UsSimError, VolumeError
 from us_sim.volume.cases.case import read_case
-from us_sim.volume.deidentification.importing import look_at
+from us_sim.volume.deidentification.importing import plan_import
 from us_sim.volume.deidentification.settings import ImportSettings
 from us_sim.volume.files.readers import read_volume
 
@@ -35,12 +35,14 @@ def test_a_volume_becomes_a_case_that_can_be_opened(volume, tmp_path, capsys):
     assert "30 × 24 × 5 voxels of 0.5 × 0.25 × 2 mm" in capsys.readouterr().out
     case = read_case(tmp_path / "arm")
     assert case.settings.name == "arm"
-    np.testing.assert_array_equal(case.volume().intensities, VOXELS)
-    np.testing.assert_allclose(case.placement()[0], read_volume(volume).index_to_patient, atol=1e-9)
+    np.testing.assert_array_equal(case.read_volume().intensities, VOXELS)
+    np.testing.assert_allclose(
+        case.read_placement()[0], read_volume(volume).index_to_patient, atol=1e-9
+    )
 
 
 def test_a_crop_leaves_every_voxel_where_it_was(volume, tmp_path):
-    look_at([volume], tmp_path / "a.nrrd", ImportSettings(crop="3,2,20,15")).write()
+    plan_import([volume], tmp_path / "a.nrrd", ImportSettings(crop="3,2,20,15")).write()
     part, whole = read_volume(tmp_path / "a.nrrd"), read_volume(volume)
     assert part.shape == (18, 14, 5)
     np.testing.assert_array_equal(part.intensities, VOXELS[3:21, 2:16])
@@ -83,20 +85,20 @@ def with_regions(path, *regions):
 def test_regions_that_cannot_be_true_are_not_believed(tmp_path, edges, kind, doubt):
     path = with_regions(tmp_path / "a.dcm", (edges, kind))
     with pytest.raises(VolumeError, match=doubt):
-        look_at([path], tmp_path / "a.nrrd", ImportSettings()).write()
+        plan_import([path], tmp_path / "a.nrrd", ImportSettings()).write()
 
 
 def test_nothing_outside_the_regions_is_shown_by_a_crop_either(tmp_path):
     path = with_regions(tmp_path / "a.dcm", ((6, 8, 20, 23), (1, 1)), ((0, 0, 5, 23), (0, 13)))
     expected = np.zeros_like(VOXELS)
     expected[6:21, 8:] = VOXELS[6:21, 8:]
-    look_at([path], tmp_path / "o.nrrd", ImportSettings()).write()
+    plan_import([path], tmp_path / "o.nrrd", ImportSettings()).write()
     np.testing.assert_array_equal(read_volume(tmp_path / "o.nrrd").intensities, expected)
-    look_at([path], tmp_path / "c.nrrd", ImportSettings(crop="3,4,12,15")).write()
+    plan_import([path], tmp_path / "c.nrrd", ImportSettings(crop="3,4,12,15")).write()
     cut = read_volume(tmp_path / "c.nrrd").intensities
     np.testing.assert_array_equal(cut, expected[3:13, 4:16])
     with pytest.raises(VolumeError, match="nothing of the ultrasound regions"):
-        look_at([path], tmp_path / "d.nrrd", ImportSettings(crop="22,0,29,23")).write()
+        plan_import([path], tmp_path / "d.nrrd", ImportSettings(crop="22,0,29,23")).write()
 
 
 def test_images_with_places_and_a_persons_spacing_are_a_volume(shared_file, tmp_path):
@@ -106,9 +108,9 @@ def test_images_with_places_and_a_persons_spacing_are_a_volume(shared_file, tmp_
         ("0.21239,0.21239,1", r"0\.21239 mm apart"),
     ):
         with pytest.raises(VolumeError, match=message):
-            look_at([folder], tmp_path / "o.nrrd", ImportSettings(spacing=spacing)).write()
+            plan_import([folder], tmp_path / "o.nrrd", ImportSettings(spacing=spacing)).write()
     given = ImportSettings(spacing="0.21239,0.21239,0.21239")
-    look_at([folder], tmp_path / "o.nrrd", given).write()
+    plan_import([folder], tmp_path / "o.nrrd", given).write()
     made = read_volume(tmp_path / "o.nrrd")
     assert made.shape == (64, 128, 16)
     steps = np.linalg.norm(made.index_to_patient[:3, :3], axis=0)
@@ -149,7 +151,7 @@ def test_files_and_outputs_that_do_not_fit_are_refused(volume, tmp_path):
         ([cine], "o.nii.gz", "4 images"),
     ):
         with pytest.raises(UsSimError, match=message):
-            look_at(files, tmp_path / out, WHOLE).write()
+            plan_import(files, tmp_path / out, WHOLE).write()
     assert other.read_bytes() == before
     names = ["DOE_JANE.dcm", "a.nrrd", "cine.dcm", "empty"]
     assert sorted(path.name for path in tmp_path.iterdir()) == names

@@ -13,7 +13,7 @@ from pydicom.uid import RLELossless
 
 from us_sim.command.main import main
 from us_sim.errors import UsSimError
-from us_sim.volume.deidentification.importing import look_at
+from us_sim.volume.deidentification.importing import plan_import
 from us_sim.volume.deidentification.settings import ImportSettings
 
 BUNDLED = Path(pydicom.__path__[0]) / "data" / "test_files"
@@ -67,7 +67,7 @@ def own_words(tmp_path_factory):
     out = folder / "out"
     out.mkdir()
     for name in ("o.nrrd", "o.mha", "o.nii.gz", "case"):
-        look_at([path], out / name, WHOLE).write()
+        plan_import([path], out / name, WHOLE).write()
     return set(re.findall(r"[A-Za-z]{4,}", written(out)[0].decode("latin-1")))
 
 
@@ -93,7 +93,7 @@ def test_every_file_that_comes_with_pydicom_is_imported_or_refused_in_a_sentence
         out = tmp_path / str(number)
         out.mkdir()
         try:
-            look_at([path], out / "o.mha", WHOLE).write()
+            plan_import([path], out / "o.mha", WHOLE).write()
         except UsSimError as error:
             sentences.append(str(error))
             assert not list(out.iterdir())
@@ -164,11 +164,11 @@ def test_of_a_volume_with_names_in_every_place(tmp_path, own_words):
         out.mkdir()
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always")
-            found = look_at([path], out / name, ImportSettings())
+            found = plan_import([path], out / name, ImportSettings())
             found.write()
         assert not [one for one in warned if PLANTED in str(one.message)]
         assert not survivors(telling(path), written(out), own_words), name
-        assert PLANTED.lower() not in found.said.lower()
+        assert PLANTED.lower() not in found.summary.lower()
         assert b"982791357" not in written(out)[0]
 
 
@@ -185,10 +185,10 @@ def test_of_other_formats_nothing_but_the_grid_goes_on(tmp_path, suffix):
     assert PLANTED.encode() in b"".join(written(tmp_path))
     out = tmp_path / "out"
     out.mkdir()
-    found = look_at([path], out / "o.nrrd", ImportSettings())
+    found = plan_import([path], out / "o.nrrd", ImportSettings())
     found.write()
     assert PLANTED.encode() not in b"".join(written(out))
-    assert PLANTED not in found.said
+    assert PLANTED not in found.summary
     again = sitk.ReadImage(str(out / "o.nrrd"))
     assert again.GetSpacing() == pytest.approx((0.5, 0.25, 2.0))
     np.testing.assert_array_equal(sitk.GetArrayFromImage(again), sitk.GetArrayFromImage(image))
@@ -206,7 +206,7 @@ def test_burned_in_text_is_gone_from_every_image(tmp_path, is_packed):
         path = write(tmp_path / "a.dcm", compressed(made, RLELossless), RLELossless)
     else:
         path = write(tmp_path / "a.dcm", made)
-    look_at([path], tmp_path / "o.mha", ImportSettings()).write()
+    plan_import([path], tmp_path / "o.mha", ImportSettings()).write()
     kept = (tmp_path / "o.mha").read_bytes()[-voxels.size :]
     expected = np.zeros_like(voxels)
     expected[6:50, 8:] = voxels[6:50, 8:]

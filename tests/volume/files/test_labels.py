@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from us_sim.errors import VolumeError
 from us_sim.volume.cases.settings import RESERVED
-from us_sim.volume.files.labels import on_grid, read_labels
+from us_sim.volume.files.labels import read_labels, resample_labels
 from us_sim.volume.files.readers import open_image
 from us_sim.volume.files.writing import write_labels
 from us_sim.volume.volume import Volume
@@ -143,7 +143,9 @@ def test_every_labelled_voxel_keeps_its_place_in_the_patient(order, signs, shift
     labels[1, 2, 2] = 2
     affine = VOLUME.index_to_patient @ turn
     try:
-        made, _ = on_grid(Path("labels.nrrd"), labels, affine, (6, 6, 6), VOLUME.index_to_patient)
+        made, _ = resample_labels(
+            Path("labels.nrrd"), labels, affine, (6, 6, 6), VOLUME.index_to_patient
+        )
     except VolumeError:
         made = np.zeros((6, 6, 6), np.uint8)
     expected = np.zeros((6, 6, 6), np.uint8)

@@ -11,12 +11,12 @@ import SimpleITK as sitk
 
 from us_sim.errors import VolumeError
 from us_sim.volume.files.readers import (
+    describe_sequence,
     open_image,
     read_placement,
     read_volume,
-    sequence_use,
 )
-from us_sim.volume.files.stored_image import grey_voxels
+from us_sim.volume.files.stored_image import read_grey_voxels
 from us_sim.volume.files.writing import write_volume
 
 SHAPE = (4, 5, 6)
@@ -111,7 +111,7 @@ def test_a_float_image_may_have_holes_and_a_vast_range(tmp_path):
     stored = np.zeros((3, 3, 3))
     stored[0, :2] = [-1.7e308, np.nan, 1.7e308], [np.inf, -np.inf, 0.0]
     path = _stored(tmp_path / "a.nrrd", stored)
-    grey, _ = grey_voxels(open_image(path))
+    grey, _ = read_grey_voxels(open_image(path))
     np.testing.assert_array_equal(grey[:, :2, 0].T, [[0, 0, 255], [255, 0, 128]])
     assert not read_volume(_stored(path, np.full((3, 3, 3), 7, np.int16))).intensities.any()
     refused(_stored(path, np.full((3, 3, 3), np.nan)), "finite")
@@ -138,7 +138,7 @@ def test_real_volumes_are_what_simpleitk_reads(shared_file, name):
 def test_a_real_sweep_of_frames_is_not_taken_for_a_volume(shared_file):
     for name in ("imfusion-liver-sweep/liver_sweep", "cases/ibis-sequence/ibis"):
         path = shared_file(f"{name}.igs.mha")
-        assert "tracked frames" in sequence_use(path)
+        assert "tracked frames" in describe_sequence(path)
         refused(path, "tracked frames")
 
 

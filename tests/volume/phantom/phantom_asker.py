@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from us_sim.volume.phantom.phantom import kept_volume, upper_arm
+from us_sim.volume.phantom.phantom import load_or_make_volume, make_upper_arm
 from us_sim.volume.volume import Volume
 
 
@@ -14,8 +14,8 @@ def ask(cache: str, marks: str, start, answers) -> None:
 
     def make() -> Volume:
         Path(marks, str(os.getpid())).touch()
-        return upper_arm(1, 1.5e-3)
+        return make_upper_arm(1, 1.5e-3)
 
     start.wait()
-    volume = kept_volume("arm", make)
+    volume = load_or_make_volume("arm", make)
     answers.put(int(volume.intensities.sum(dtype=np.int64)))

@@ -5,13 +5,13 @@ import pytest
 from scipy import stats
 
 from us_sim.errors import VolumeError
-from us_sim.volume.phantom.phantom import upper_arm
+from us_sim.volume.phantom.phantom import make_upper_arm
 from us_sim.volume.phantom.upper_arm import (
     UPPER_ARM_BLOCK,
     UPPER_ARM_LABELS,
     PointSpread,
     UpperArm,
-    echo_envelope,
+    compute_envelope,
 )
 from us_sim.volume.volume import Volume
 
@@ -20,13 +20,13 @@ COARSE = 0.8e-3
 
 @pytest.fixture(scope="module")
 def arm() -> Volume:
-    return upper_arm(seed=1, voxel_size=COARSE)
+    return make_upper_arm(seed=1, voxel_size=COARSE)
 
 
 @pytest.fixture(scope="module")
 def section():
     x, z = np.arange(-36e-3, 36e-3, 0.1e-3), np.arange(0.05e-3, 54e-3, 0.1e-3)
-    return UpperArm(seed=1).section(x, 0.0, z)
+    return UpperArm(seed=1).cut_section(x, 0.0, z)
 
 
 def _centre(section, label):
@@ -68,14 +68,16 @@ def test_structures_of_any_seed_keep_apart(seed):
     arm = UpperArm(seed)
     x, z = np.arange(-20e-3, 25e-3, 0.1e-3), np.arange(5e-3, 50e-3, 0.1e-3)
     for y in (-0.03, 0.0, 0.03):
-        walls = [t.distance(x, y, z) for t in (arm.artery, arm.vein, arm.nerve, arm.humerus)]
+        walls = [
+            t.compute_distances(x, y, z) for t in (arm.artery, arm.vein, arm.nerve, arm.humerus)
+        ]
         nearest = np.sort(walls, axis=0)
         assert (nearest[0] + nearest[1]).min() > 0.2e-3
 
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_another_one_moves_and_redraws(arm):
-    again, other = (upper_arm(seed=seed, voxel_size=COARSE) for seed in (1, 2))
+    again, other = (make_upper_arm(seed=seed, voxel_size=COARSE) for seed in (1, 2))
     assert again.intensities.tobytes() == arm.intensities.tobytes()
     assert again.labels.tobytes() == arm.labels.tobytes()
     assert (other.intensities != arm.intensities).mean() > 0.5
@@ -92,7 +94,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_one_moves_and_redraws(ar
 )
 def test_bad_arguments_are_refused(arguments, message):
     with pytest.raises(VolumeError, match=message):
-        upper_arm(**arguments)
+        make_upper_arm(**arguments)
 
 
 VOXEL = 0.3e-3
@@ -107,9 +109,9 @@ def _random() -> np.random.Generator:
 
 def test_speckle_is_rayleigh_and_keeps_the_power_of_the_scatterers():
     scatterers = np.full(SHAPE, 0.02, dtype=np.float32)
-    envelope = echo_envelope(scatterers, 0 * scatterers, VOXEL, DEPTH, SPREAD, _random())
+    envelope = compute_envelope(scatterers, 0 * scatterers, VOXEL, DEPTH, SPREAD, _random())
     # Without the edges that the spread reaches.
-    reach = np.ceil(np.array(SPREAD.reach(DEPTH)) / VOXEL).astype(int)
+    reach = np.ceil(np.array(SPREAD.compute_reach(DEPTH)) / VOXEL).astype(int)
     even = envelope[tuple(slice(r, n - r) for r, n in zip(reach, SHAPE, strict=True))]
     assert np.sqrt((even.astype(float) ** 2).mean()) == pytest.approx(0.02, rel=0.02)
     # Every fifth to eighth voxel, beyond the point spread's width: samples are independent.
@@ -125,7 +127,7 @@ def test_speckle_correlates_as_the_point_spread_says():
     step = 0.15e-3
     depth = SPREAD.focus + (np.arange(60) - 30) * step
     scatterers = np.ones((120, 100, 60), np.float32)
-    power = echo_envelope(scatterers, 0 * scatterers, step, depth, SPREAD, _random())[
+    power = compute_envelope(scatterers, 0 * scatterers, step, depth, SPREAD, _random())[
         20:-20, 20:-20
     ]
     power = power.astype(float) ** 2

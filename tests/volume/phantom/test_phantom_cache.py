@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from phantom_asker import ask
 
-from us_sim.volume.phantom.phantom import cached_phantom, kept_volume, upper_arm
+from us_sim.volume.phantom.phantom import load_or_make_phantom, load_or_make_volume, make_upper_arm
 from us_sim.volume.volume import Volume
 
 COARSE = 2e-3
@@ -34,12 +34,12 @@ def _unused() -> Volume:
 @pytest.mark.usefixtures("cache")
 def test_a_phantom_comes_back_as_it_was_made():
     said = []
-    made = cached_phantom("upper_arm", 1, COARSE, lambda *what: said.append(what))
+    made = load_or_make_phantom("upper_arm", 1, COARSE, lambda *what: said.append(what))
     fractions = [fraction for fraction, _ in said]
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1.0
-    kept = cached_phantom("upper_arm", 1, COARSE, lambda *_: pytest.fail("was in the cache"))
-    fresh = upper_arm(1, COARSE)
+    kept = load_or_make_phantom("upper_arm", 1, COARSE, lambda *_: pytest.fail("was in the cache"))
+    fresh = make_upper_arm(1, COARSE)
     for volume in (made, kept):
         np.testing.assert_array_equal(volume.intensities, fresh.intensities)
         np.testing.assert_array_equal(volume.labels, fresh.labels)
@@ -50,9 +50,9 @@ def test_a_phantom_comes_back_as_it_was_made():
 def test_what_a_killed_process_left_is_cleared_away_and_kept_arrays_are_not_copied(cache):
     left_over = cache / "small.partial"
     left_over.mkdir(parents=True)
-    kept_volume("small", _small)
+    load_or_make_volume("small", _small)
     assert not left_over.exists()
-    base = kept_volume("small", _unused).labels
+    base = load_or_make_volume("small", _unused).labels
     while not isinstance(base, np.memmap):
         base = base.base
     assert Path(base.filename).parent == cache / "small"
@@ -66,21 +66,21 @@ def test_what_a_killed_process_left_is_cleared_away_and_kept_arrays_are_not_copi
     ],
 )
 def test_a_damaged_entry_is_made_again_with_a_word(cache, caplog, damage):
-    kept_volume("small", _small)
+    load_or_make_volume("small", _small)
     damage(cache / "small")
     with caplog.at_level(logging.WARNING):
-        mended = kept_volume("small", _small)
+        mended = load_or_make_volume("small", _small)
     assert "is damaged" in caplog.text
     assert "made again" in caplog.text
     np.testing.assert_array_equal(mended.labels, _small().labels)
-    np.testing.assert_array_equal(kept_volume("small", _unused).labels, _small().labels)
+    np.testing.assert_array_equal(load_or_make_volume("small", _unused).labels, _small().labels)
 
 
 def test_a_cache_that_cannot_be_written_costs_only_a_warning(tmp_path, monkeypatch, caplog):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("US_SIM_CACHE", str(tmp_path / "file" / "cache"))
     with caplog.at_level(logging.WARNING):
-        volume = kept_volume("small", _small)
+        volume = load_or_make_volume("small", _small)
     assert "cannot be written" in caplog.text
     np.testing.assert_array_equal(volume.intensities, _small().intensities)
 

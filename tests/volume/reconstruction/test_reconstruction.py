@@ -16,11 +16,11 @@ from us_sim.volume.files.readers import read_volume
 from us_sim.volume.reconstruction.calibration_file import read_calibration
 from us_sim.volume.reconstruction.grid import (
     Grid,
-    grid_around,
-    image_mask,
+    fit_grid,
+    make_image_mask,
 )
-from us_sim.volume.reconstruction.insertion import fill_holes, insert_pixels, mean_values
-from us_sim.volume.reconstruction.reconstruction import plan, reconstruct
+from us_sim.volume.reconstruction.insertion import compute_means, fill_holes, insert_pixels
+from us_sim.volume.reconstruction.reconstruction import plan_insertion, reconstruct
 from us_sim.volume.reconstruction.settings import Compounding, ImagePart
 from us_sim.volume.sequences.sweep import read_sweep
 
@@ -68,7 +68,7 @@ def truth(made):
 
 @pytest.mark.slow
 def test_a_known_field_comes_back(sweep):
-    made = reconstruct(plan(sweep, Compounding(spacing=0.5e-3)))
+    made = reconstruct(plan_insertion(sweep, Compounding(spacing=0.5e-3)))
     error = np.abs(made.volume.intensities - truth(made))[made.covered]
     # Within a voxel the field changes by up to 9 levels a mm, over 0.43 mm at most.
     assert error.max() <= 9.0
@@ -81,7 +81,7 @@ def test_a_voxel_holds_the_mean_of_its_pixels(values):
     total, count = np.zeros((2, 2, 2, 2), np.uint32)
     pixels = np.array(values, np.uint8)
     insert_pixels(pixels, np.zeros((len(values), 3)), np.eye(3, 4), total, count)
-    grey, covered = mean_values(total, count)
+    grey, covered = compute_means(total, count)
     assert covered.sum() == 1
     assert grey[0, 0, 0] == pytest.approx(np.mean(values), abs=0.5)
 
@@ -103,15 +103,15 @@ def test_holes_are_filled_between_what_was_hit_and_nowhere_else():
 
 def test_a_mask_is_a_rectangle_and_a_fan():
     fan = ImagePart(fan_origin=[50, 0], fan_radius=[20, 60], fan_angles=["-30 deg", "30 deg"])
-    used = image_mask(fan, 101, 80)
+    used = make_image_mask(fan, 101, 80)
     rows, columns = np.indices(used.shape)
     radius, angle = np.hypot(columns - 50, rows), np.degrees(np.arctan2(columns - 50, rows))
     assert not used[(radius < 19) | (radius > 60) | (abs(angle) > 30)].any()
     assert used[(radius > 21) & (radius < 58) & (abs(angle) < 27)].all()  # but for its border
-    clipped = image_mask(dataclasses.replace(fan, clip=(0, 30, 50, 20)), 101, 80)
+    clipped = make_image_mask(dataclasses.replace(fan, clip=(0, 30, 50, 20)), 101, 80)
     assert clipped[30:51, :51].sum() == clipped.sum() == used[30:51, :51].sum()
     with pytest.raises(VolumeError, match=r"no pixel.*30 × 40"):
-        image_mask(ImagePart(clip=(100, 0, 5, 5)), 30, 40)
+        make_image_mask(ImagePart(clip=(100, 0, 5, 5)), 30, 40)
 
 
 @pytest.mark.parametrize(
@@ -128,14 +128,14 @@ def test_a_part_that_is_none_is_refused(values, message):
 
 def test_a_grid_that_is_too_large_is_refused_before_it_is_made(sweep, monkeypatch):
     with pytest.raises(VolumeError, match=r"536870912.*--spacing"):
-        plan(sweep, Compounding(spacing=1e-5))
-    planned = plan(sweep, Compounding())
+        plan_insertion(sweep, Compounding(spacing=1e-5))
+    planned = plan_insertion(sweep, Compounding())
     assert planned.grid.spacing == pytest.approx(PIXEL)
-    monkeypatch.setattr(stored_image, "free_memory", lambda: 1e5)
+    monkeypatch.setattr(stored_image, "measure_free_memory", lambda: 1e5)
     with pytest.raises(VolumeError, match="GB"):
         reconstruct(planned)
     with pytest.raises(VolumeError, match="--spacing"):
-        grid_around(np.array([[0.0, 0, 0], [0.01, 0.01, 0.001]]), 0.005)
+        fit_grid(np.array([[0.0, 0, 0], [0.01, 0.01, 0.001]]), 0.005)
 
 
 def test_what_calibrate_probe_writes_is_read(tmp_path):
@@ -197,7 +197,7 @@ def test_volumes_of_plus_come_out_as_plus_made_them(shared_file, name):
     path = folder / "SpinePhantomFreehand.igs.mha"
     sweep = read_sweep(path, calibration=calibration.transforms)
     how = Compounding(spacing=0.5e-3, hole_radius=0.0)
-    made = reconstruct(plan(sweep, how, calibration.part))
+    made = reconstruct(plan_insertion(sweep, how, calibration.part))
     reference = read_volume(folder / f"VolumeReconstructorTest{name}volumeRef.mha")
     assert made.volume.shape == reference.shape
     # The file gives its place to six digits.
@@ -218,7 +218,7 @@ def test_the_liver_sweep_comes_out_as_others_compounded_it(shared_file):
     )
     how = Compounding(spacing="1 mm")
     grid = Grid(reference.index_to_patient, reference.shape)
-    made = reconstruct(dataclasses.replace(plan(sweep, how, fan), grid=grid))
+    made = reconstruct(dataclasses.replace(plan_insertion(sweep, how, fan), grid=grid))
     found = compare(made, reference)
     assert found[0] >= 0.998
     assert found[1] >= 0.98

@@ -9,8 +9,13 @@ from hypothesis import strategies as st
 from sweep_file import write_sweep
 
 from us_sim.volume.reconstruction.calibration_file import read_calibration
-from us_sim.volume.reconstruction.grid import image_mask
-from us_sim.volume.reconstruction.scanning_probe import Fan, Rectangle, fitted_part, scanning_probe
+from us_sim.volume.reconstruction.grid import make_image_mask
+from us_sim.volume.reconstruction.scanning_probe import (
+    Fan,
+    Rectangle,
+    find_scanning_probe,
+    fit_part,
+)
 from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.sweep import read_sweep
 
@@ -41,7 +46,7 @@ def test_fans_are_found_to_a_pixel(begins, half, tilt, unlike, noise):
     rng = np.random.default_rng(noise)
     mask &= rng.random(mask.shape) > 0.02  # black specks
     mask[5:12, 5:40] = True  # letters beside it
-    found = fitted_part(mask, side)
+    found = fit_part(mask, side)
     assert isinstance(found, Fan)
     np.testing.assert_allclose(found.apex, [0.1, top], atol=1.5e-3)
     np.testing.assert_allclose(found.radius, [begins, 0.14 * unlike - top], atol=1.5e-3)
@@ -55,7 +60,7 @@ BOX[10:250, 100:200] = True
 def test_a_rectangle_is_a_linear_arrays_and_a_shadow_in_it_does_no_harm():
     mask = BOX.copy()
     mask[150:200, 130:160] = False
-    found = fitted_part(mask, SIDE)
+    found = fit_part(mask, SIDE)
     assert isinstance(found, Rectangle)
     np.testing.assert_allclose(found.x, [0.04975, 0.09975], atol=1e-9)
     np.testing.assert_allclose(found.z, [0.00475, 0.12475], atol=1e-9)
@@ -75,7 +80,7 @@ def swept(tmp_path, mask, matrices=None):
 
 def test_the_poses_are_of_the_middle_of_the_face(tmp_path):
     mask = fan_mask(0.1, -0.03, 0.04, 0.11, -20, 30)
-    found = scanning_probe(swept(tmp_path, mask), ImagePart(), np.ones_like(mask))
+    found = find_scanning_probe(swept(tmp_path, mask), ImagePart(), np.ones_like(mask))
     array = found.probe.array.given
     assert found.probe.geometry == "convex"
     assert array.radius == pytest.approx(0.04, abs=5e-4)
@@ -94,14 +99,14 @@ def test_a_part_that_is_named_is_the_probes(tmp_path):
     mask = np.random.default_rng(0).random((ROWS, COLUMNS)) < 0.3  # proves nothing
     sweep = swept(tmp_path, mask)
     part = ImagePart(clip=(100, 40, 79, 119))
-    found = scanning_probe(sweep, part, image_mask(part, COLUMNS, ROWS))
+    found = find_scanning_probe(sweep, part, make_image_mask(part, COLUMNS, ROWS))
     assert found.probe.geometry == "linear"
     assert found.probe.array.given.aperture == pytest.approx(80 * SIDE[0])
     assert found.probe.array.given.depth == pytest.approx(120 * SIDE[1])
     np.testing.assert_allclose(found.poses[0].position, [-139.5 * SIDE[0], 0, 39.5 * SIDE[1]])
     angles = ["-30 deg", "30 deg"]
     part = ImagePart(fan_origin=[200, -60], fan_radius=[80, 220], fan_angles=angles)
-    found = scanning_probe(sweep, part, image_mask(part, COLUMNS, ROWS))
+    found = find_scanning_probe(sweep, part, make_image_mask(part, COLUMNS, ROWS))
     array = found.probe.array.given
     assert (array.radius, array.depth) == (0.04, 0.07)
     assert math.degrees(array.opening_angle) == pytest.approx(60.0, abs=1e-3)
@@ -127,8 +132,8 @@ def test_the_linear_array_of_a_real_sweep_is_found(
     calibration = read_calibration(shared_file(folder) / configuration, "Probe")
     path = shared_file(folder) / recording
     sweep = read_sweep(path, calibration=calibration.transforms)
-    used = image_mask(calibration.part, sweep.columns, sweep.rows)
-    found = scanning_probe(sweep, calibration.part, used)
+    used = make_image_mask(calibration.part, sweep.columns, sweep.rows)
+    found = find_scanning_probe(sweep, calibration.part, used)
     assert found.probe.geometry == "linear"
     column, row = np.linalg.norm(sweep.image_to_reference[0][:3, :2], axis=0)
     array = found.probe.array.given
@@ -145,7 +150,7 @@ def test_the_linear_array_of_a_real_sweep_is_found(
 def test_the_curved_array_of_a_real_sweep_is_found_in_its_images(shared_data):
     sweep = read_sweep(shared_data / "imfusion-liver-sweep" / "liver_sweep.igs.mha")
     used = np.ones((sweep.rows, sweep.columns), bool)
-    found = scanning_probe(sweep, ImagePart(), used)
+    found = find_scanning_probe(sweep, ImagePart(), used)
     array = found.probe.array.given
     # Its publisher's: 161.34 pixels, 30.28° to either side; beams end at 724.35 pixels by it,
     # but the images go on to their last row, 592, which is 731 pixels from the apex.

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from us_sim.errors import VolumeError
-from us_sim.settings.reading import Reader
+from us_sim.settings.reading import SettingsReader
 from us_sim.volume.files.readers import read_volume
 from us_sim.volume.segmentation.settings import SegmentationSettings, read_seeds
-from us_sim.volume.segmentation.structures import segment
+from us_sim.volume.segmentation.structures import segment_volume
 from us_sim.volume.volume import Volume
 
 STEPS = np.array([0.5e-3, 0.5e-3, 1e-3])
@@ -46,11 +46,11 @@ def two_tubes():
 
 
 def read(document):
-    return Reader("seeds.yaml", None, VolumeError).read(SegmentationSettings, document)
+    return SettingsReader("seeds.yaml", None, VolumeError).read(SegmentationSettings, document)
 
 
 def found(volume, **structures):
-    return segment(volume, read({"structures": structures}))
+    return segment_volume(volume, read({"structures": structures}))
 
 
 def overlap(one, other):
@@ -137,7 +137,7 @@ SEEDS = Path(__file__).resolve().parents[3] / "config" / "seeds"
 
 def test_seeds_find_dark_vessels_in_a_real_liver(shared_file):
     whole = read_volume(shared_file("imfusion-liver-sweep/liver_sweep_compounded_1mm.mha"))
-    by_seeds = segment(whole, read_seeds(SEEDS / "liver_sweep.yaml"))
+    by_seeds = segment_volume(whole, read_seeds(SEEDS / "liver_sweep.yaml"))
     for label, name in by_seeds.names.items():
         assert 2e3 < by_seeds.voxels[name] < 2e4  # mm³
         grey = whole.intensities[by_seeds.labels == label].mean()

@@ -10,7 +10,7 @@ import SimpleITK as sitk
 from us_sim.errors import VolumeError
 from us_sim.volume.sequences.sequence import read_sequence
 from us_sim.volume.sequences.sweep import read_sweep
-from us_sim.volume.sequences.transforms import in_metres
+from us_sim.volume.sequences.transforms import to_metres
 
 FRAMES, ROWS, COLUMNS = 3, 4, 5
 GREY = np.random.default_rng(5).integers(0, 256, (FRAMES, ROWS, COLUMNS), dtype=np.uint8)
@@ -74,7 +74,7 @@ def nrrd(path, stored, pack=None, *, kinds="domain domain domain list", sizes=No
 def refused(path, message):
     """One sentence that begins with the file."""
     with pytest.raises(VolumeError, match=message) as error:
-        list(read_sweep(path).images())
+        list(read_sweep(path).read_images())
     assert str(error.value).startswith(f"{path}: ")
     assert "\n" not in str(error.value)
 
@@ -85,7 +85,7 @@ def test_images_are_turned_as_their_orientation_says(tmp_path, orientation):
     path = metaimage(tmp_path / "a.igs.mha", stored, UltrasoundImageOrientation=orientation)
     sequence = read_sequence(path)
     assert (sequence.rows, sequence.columns) == GREY.shape[1:]
-    np.testing.assert_array_equal(list(sequence.images()), GREY)
+    np.testing.assert_array_equal(list(sequence.read_images()), GREY)
 
 
 PACKED = zlib.compress(GREY.tobytes())
@@ -107,8 +107,8 @@ def test_images_poses_and_times_are_those_of_the_file(tmp_path, write, how):
     sweep = read_sweep(write(tmp_path / f"a.{ENDINGS[write]}", GREY, **how))
     assert (sweep.columns, sweep.rows, sweep.left_out) == (COLUMNS, ROWS, {})
     np.testing.assert_allclose(sweep.times, [10.0, 10.1, 10.2])
-    np.testing.assert_array_equal(np.array(list(sweep.images())), GREY)
-    np.testing.assert_array_equal(np.array(list(sweep.images([2, 0]))), GREY[[2, 0]])
+    np.testing.assert_array_equal(np.array(list(sweep.read_images())), GREY)
+    np.testing.assert_array_equal(np.array(list(sweep.read_images([2, 0]))), GREY[[2, 0]])
     # Column 4 and row 3 of frame 1: 1 + 0.2 * 4 mm, 0, 30 + 0.2 * 3 mm.
     np.testing.assert_allclose(
         sweep.image_to_reference[1] @ [4, 3, 0, 1], [1.8e-3, 0.0, 30.6e-3, 1.0], atol=1e-15
@@ -129,7 +129,7 @@ def test_colours_are_made_grey_by_their_brightness(tmp_path, write):
     sequence = read_sequence(path)
     assert sequence.are_colours
     # Rec. 601, luma: 0.299 R + 0.587 G + 0.114 B.
-    assert [int(image[1, 2]) for image in sequence.images()] == [76, 150, 90]
+    assert [int(image[1, 2]) for image in sequence.read_images()] == [76, 150, 90]
 
 
 @pytest.mark.parametrize("kind", ["<u2", ">i2", "<f4"])
@@ -140,7 +140,7 @@ def test_images_of_more_than_8_bits_are_spread_over_all_frames(tmp_path, kind):
     more = {"ElementType": element, "BinaryDataByteOrderMSB": order}
     sequence = read_sequence(metaimage(tmp_path / "a.mha", deep, **more))
     scaled = (GREY - float(GREY.min())) / np.ptp(GREY) * 255.0
-    np.testing.assert_array_equal(list(sequence.images()), np.floor(scaled + 0.5))
+    np.testing.assert_array_equal(list(sequence.read_images()), np.floor(scaled + 0.5))
 
 
 def test_a_real_flat_sequence_of_plus_has_the_images_that_itk_reads(shared_file):
@@ -148,7 +148,7 @@ def test_a_real_flat_sequence_of_plus_has_the_images_that_itk_reads(shared_file)
     sequence = read_sequence(path)
     assert (sequence.columns, sequence.rows, len(sequence)) == (820, 616, 97)
     stored = sitk.GetArrayFromImage(sitk.ReadImage(str(path)))  # (row, column, frame)
-    (image,) = sequence.images([50])
+    (image,) = sequence.read_images([50])
     np.testing.assert_array_equal(image, stored[:, :, 50])
 
 
@@ -169,7 +169,7 @@ def test_a_frame_that_cannot_be_used_is_left_out_and_counted(tmp_path, broken, r
     sweep = read_sweep(metaimage(tmp_path / "a.mha", frames={1: broken}))
     assert sweep.left_out == {reason: 1}
     assert sweep.numbers.tolist() == [0, 2]
-    np.testing.assert_array_equal(np.array(list(sweep.images())), GREY[[0, 2]])
+    np.testing.assert_array_equal(np.array(list(sweep.read_images())), GREY[[0, 2]])
     np.testing.assert_allclose(sweep.image_to_reference[:, 0, 3], [0.0, 2e-3])
 
 
@@ -201,7 +201,7 @@ def test_a_sequence_of_another_kind_is_refused(tmp_path, write, fields, message)
 def test_damaged_compression_is_noticed_where_the_images_are_read(tmp_path, data, message):
     sweep = read_sweep(metaimage(tmp_path / "a.mha", data=data, CompressedData="True"))
     with pytest.raises(VolumeError, match=message):
-        list(sweep.images())
+        list(sweep.read_images())
 
 
 @pytest.mark.parametrize(
@@ -224,7 +224,7 @@ def test_the_real_liver_sweep_is_what_simpleitk_reads(shared_file):
     sizes = np.linalg.norm(sweep.image_to_reference[:, :3, :2], axis=1)
     np.testing.assert_allclose(sizes, 0.314818e-3, rtol=1e-6)  # as its source states
     stored = sitk.GetArrayFromImage(sitk.ReadImage(str(path)))
-    for k, image in enumerate(sweep.images()):
+    for k, image in enumerate(sweep.read_images()):
         assert np.array_equal(image, stored[k])
 
 
@@ -232,7 +232,7 @@ def test_a_chain_by_way_of_the_tracker_places_images_of_plus_as_its_formula_says
     path = shared_file("plus-spine-freehand/SpinePhantomFreehand.igs.mha")
     calibration = np.diag([0.08, 0.08, 0.08, 1.0])
     calibration[:3, 3] = (15.4, 49.6, -8.6)  # mm
-    sweep = read_sweep(path, calibration={"ImageToProbe": in_metres("ImageToProbe", calibration)})
+    sweep = read_sweep(path, calibration={"ImageToProbe": to_metres("ImageToProbe", calibration)})
     assert [name for name, _ in sweep.chain.steps] == [
         "ImageToProbe",
         "ProbeToTracker",

@@ -9,11 +9,11 @@ from hypothesis.extra.numpy import arrays
 
 from us_sim.errors import VolumeError
 from us_sim.skin.surface import read_surface
-from us_sim.volume.phantom.phantom import cached_phantom
+from us_sim.volume.phantom.phantom import load_or_make_phantom
 from us_sim.volume.surfaces.label_surface import (
-    enclosed_volume,
-    label_surface,
-    spacing_for,
+    choose_spacing,
+    compute_enclosed_volume,
+    make_label_surface,
     write_stl,
 )
 from us_sim.volume.volume import Volume
@@ -47,9 +47,9 @@ def test_a_ball_keeps_its_volume_and_faces_outwards(radius, steps, mirrored, see
     affine[:3, 3] = [0.1, -0.2, 0.3]
     mask = ((np.indices((32, 32, 32)) - 15.3) ** 2).sum(axis=0) < radius**2
     volume = labelled(mask, affine)
-    vertices, triangles = label_surface(volume, 3)
+    vertices, triangles = make_label_surface(volume, 3)
     require_closed(triangles)
-    assert enclosed_volume(vertices, triangles) == pytest.approx(
+    assert compute_enclosed_volume(vertices, triangles) == pytest.approx(
         mask.sum() * np.prod(steps), rel=0.01
     )
     centre = affine[:3, :3] @ np.full(3, 15.3) + affine[:3, 3]
@@ -66,9 +66,9 @@ def test_any_labels_have_a_closed_surface_that_faces_outwards(mask, steps, mirro
     mask.flat[0] = True
     affine = np.diag([*steps, 1.0])
     affine[0] *= -1 if mirrored else 1
-    vertices, triangles = label_surface(labelled(mask, affine), 3)
+    vertices, triangles = make_label_surface(labelled(mask, affine), 3)
     require_closed(triangles)
-    assert enclosed_volume(vertices, triangles) > 0.0
+    assert compute_enclosed_volume(vertices, triangles) > 0.0
 
 
 CORNERS = np.array([[0.01, 0.02, 0.03], [0.05, 0, 0], [0, 0.061, 0], [0, 0, 0.0723]])
@@ -80,32 +80,34 @@ def test_meshio_and_the_scenes_reader_find_the_same_surface_in_millimetres(tmp_p
     there = meshio.read(path)
     for vertices in (there.points * 1e-3, read_surface(path, 1e-3).vertices):
         np.testing.assert_allclose(np.sort(vertices, axis=0), np.sort(CORNERS, axis=0), atol=1e-8)
-    found = enclosed_volume(there.points * 1e-3, there.cells_dict["triangle"])
-    assert found == pytest.approx(enclosed_volume(CORNERS, triangles), rel=1e-5)
+    found = compute_enclosed_volume(there.points * 1e-3, there.cells_dict["triangle"])
+    assert found == pytest.approx(compute_enclosed_volume(CORNERS, triangles), rel=1e-5)
     assert b"SPACE=LPS" in path.read_bytes()[:80]
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_structures_of_the_arm_keep_their_volume_within_the_triangles_allowed():
-    arm = cached_phantom("upper_arm", seed=1, voxel_size=0.6e-3)
+    arm = load_or_make_phantom("upper_arm", seed=1, voxel_size=0.6e-3)
     labels = [n for n, name in arm.label_names.items() if name in ("vein", "artery", "bone")]
     for allowed in (30_000, 15_000):
-        spacing = spacing_for(arm, labels, allowed)
-        made = [label_surface(arm, label, spacing) for label in labels]
+        spacing = choose_spacing(arm, labels, allowed)
+        made = [make_label_surface(arm, label, spacing) for label in labels]
         assert sum(len(faces) for _, faces in made) == pytest.approx(allowed, rel=0.1)
         for label, (vertices, triangles) in zip(labels, made, strict=True):
             voxels = np.count_nonzero(arm.labels == label) * 0.6e-3**3
-            assert enclosed_volume(vertices, triangles) == pytest.approx(voxels, rel=0.03)
+            assert compute_enclosed_volume(vertices, triangles) == pytest.approx(voxels, rel=0.03)
 
 
 def test_a_box_cuts_and_caps():
     mask = np.zeros((30, 60, 30), bool)
     mask[10:20, :, 10:20] = True
     box = np.array([[-1.0, 0.0205, -1.0], [1.0, 0.0405, 1.0]])
-    vertices, triangles = label_surface(labelled(mask), 3, within=box)
+    vertices, triangles = make_label_surface(labelled(mask), 3, within=box)
     require_closed(triangles)
-    assert enclosed_volume(vertices, triangles) == pytest.approx(10 * 20 * 10 * 1e-9, rel=0.01)
+    assert compute_enclosed_volume(vertices, triangles) == pytest.approx(
+        10 * 20 * 10 * 1e-9, rel=0.01
+    )
     np.testing.assert_allclose([vertices[:, 1].min(), vertices[:, 1].max()], box[:, 1], atol=2e-4)
 
 
@@ -124,4 +126,4 @@ BARE = Volume(SMALL.intensities, SMALL.index_to_patient)
 )
 def test_what_has_no_surface_is_said(volume, label, how, message):
     with pytest.raises(VolumeError, match=message):
-        label_surface(volume, label, **how)
+        make_label_surface(volume, label, **how)

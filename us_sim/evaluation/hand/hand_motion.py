@@ -24,7 +24,7 @@ _Array = NDArray[np.float64]
 _Point = tuple[float, float, float]
 
 
-class Haste(NamedTuple):
+class HandSpeed(NamedTuple):
     """How fast a hand is: medians over a motion."""
 
     speed: float  # m/s, of the probe's face
@@ -32,9 +32,9 @@ class Haste(NamedTuple):
 
 
 HASTES = {
-    "careful": Haste(0.020, math.radians(30)),
-    "brisk": Haste(0.060, math.radians(90)),
-    "violent": Haste(0.300, math.radians(360)),
+    "careful": HandSpeed(0.020, math.radians(30)),
+    "brisk": HandSpeed(0.060, math.radians(90)),
+    "violent": HandSpeed(0.300, math.radians(360)),
 }
 """By name, from a sonographer who looks to one who wants to break something."""
 
@@ -84,7 +84,7 @@ KINDS = {
 """By name."""
 
 
-def hand_motion(kind: str, haste: str, seed: int, duration: float = 5.0) -> list[Pose]:
+def make_hand_motion(kind: str, haste: str, seed: int, duration: float = 5.0) -> list[Pose]:
     """Make a random motion of a hand, and its approach from above the skin.
 
     Each coordinate follows a sum of waves of a narrow band of frequencies and random phases, which
@@ -105,26 +105,30 @@ def hand_motion(kind: str, haste: str, seed: int, duration: float = 5.0) -> list
     low, high, angles = np.array([motion.low, motion.high, motion.turn])
     # The same number must not give the kinds' coordinates the same curves.
     random = np.random.default_rng([seed, zlib.crc32(f"{kind} {haste}".encode())])
-    moving, turning = _wander(random, motion.steep), _wander(random, motion.steep)
+    moving, turning = _make_curves(random, motion.steep), _make_curves(random, motion.steep)
 
-    def place(times: _Array) -> _Array:
+    def compute_positions(times: _Array) -> _Array:
         return np.asarray(low + (high - low) * moving(times))
 
-    def turn(times: _Array) -> Rotation:
+    def compute_rotations(times: _Array) -> Rotation:
         return Rotation.from_euler("ZXY", angles * (2 * turning(times) - 1))
 
-    def speeds(times: _Array) -> _Array:
-        return np.asarray(RATE * np.linalg.norm(np.diff(place(times), axis=0), axis=1))
+    def measure_speeds(times: _Array) -> _Array:
+        return np.asarray(RATE * np.linalg.norm(np.diff(compute_positions(times), axis=0), axis=1))
 
-    def turnings(times: _Array) -> _Array:
-        turned = turn(times)
+    def measure_turning(times: _Array) -> _Array:
+        turned = compute_rotations(times)
         return np.asarray(RATE * (turned[:-1].inv() * turned[1:]).magnitude())
 
     coming = round(RATE * APPROACH)
     times = np.arange(round(RATE * duration)) / RATE
     begun = np.concatenate([np.zeros(coming), times])
-    positions = place(begun * (_tempo(speeds, asked.speed, times) if np.any(high > low) else 0.0))
-    turns = turn(begun * (_tempo(turnings, asked.turning, times) if angles.any() else 0.0))
+    positions = compute_positions(
+        begun * (_find_tempo(measure_speeds, asked.speed, times) if np.any(high > low) else 0.0)
+    )
+    turns = compute_rotations(
+        begun * (_find_tempo(measure_turning, asked.turning, times) if angles.any() else 0.0)
+    )
     part = np.arange(coming) / coming
     # From rest to rest as a hand moves (Flash and Hogan 1985).
     smooth = part**3 * (10 - 15 * part + 6 * part**2)
@@ -136,27 +140,27 @@ def hand_motion(kind: str, haste: str, seed: int, duration: float = 5.0) -> list
     return [Pose(*placed) for placed in zip(positions, orientations, strict=True)]
 
 
-def _wander(random: np.random.Generator, steep: float) -> Callable[[_Array], _Array]:
+def _make_curves(random: np.random.Generator, steep: float) -> Callable[[_Array], _Array]:
     """Three random curves of times (K,), with values (K, 3) from 0 to 1."""
     count = 6
     frequency = random.uniform(0.4, 1.6, (count, 3))  # cycles of the curve's own unit of time
     phase = random.uniform(0.0, 2 * np.pi, (count, 3))
 
-    def curve(times: _Array) -> _Array:
+    def evaluate_curves(times: _Array) -> _Array:
         waves = np.sin(2 * np.pi * frequency * times[:, None, None] + phase).sum(axis=1)
         # Its variance is half the number of waves; of a normal variable this is uniform.
         return np.asarray(0.5 + 0.5 * erf(steep * waves / math.sqrt(count)))
 
-    return curve
+    return evaluate_curves
 
 
-def _tempo(speeds: Callable[[_Array], _Array], asked: float, times: _Array) -> float:
+def _find_tempo(speeds: Callable[[_Array], _Array], asked: float, times: _Array) -> float:
     """Find how many of its units a curve runs through in a second for its median speed."""
 
-    def excess(tempo: float) -> float:
+    def compute_excess(tempo: float) -> float:
         return float(np.median(speeds(tempo * times))) - asked
 
     high = 1e-4
-    while excess(high) < 0.0:
+    while compute_excess(high) < 0.0:
         high *= 2.0
-    return float(brentq(excess, 0.5 * high, high))
+    return float(brentq(compute_excess, 0.5 * high, high))

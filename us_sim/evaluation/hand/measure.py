@@ -4,8 +4,8 @@ Nodes are compared with the converged answer: a ``fem_nonlinear`` with the setti
 converges follows the poses in order, and is called again at each until it has converged, or goes no
 further.
 
->>> from us_sim.evaluation.hand.measure import motions
->>> motions(quick=True, seed=1)[0]
+>>> from us_sim.evaluation.hand.measure import list_motions
+>>> list_motions(quick=True, seed=1)[0]
 Motion(kind='free', haste='brisk', seed=1, duration=2.0)
 """
 
@@ -23,14 +23,14 @@ import pandas as pd
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from us_sim.evaluation.hand.hand_motion import APPROACH, HASTES, KINDS, RATE, hand_motion
+from us_sim.evaluation.hand.hand_motion import APPROACH, HASTES, KINDS, RATE, make_hand_motion
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.geometry.pose import Pose
-from us_sim.scene.building import tissue_model_of, volume_of
+from us_sim.scene.building import build_tissue_model, load_volume
 from us_sim.scene.reading import load_scene
 from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
 from us_sim.tissue.model import Deformation, TissueModel
-from us_sim.tissue.solvers.frame_budget import Pace
+from us_sim.tissue.solvers.frame_budget import FramePace
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
 METHOD = "fem_nonlinear"  # the method whose converged frames are the answer
@@ -43,14 +43,14 @@ _Array = NDArray[np.float64]
 
 
 @cache
-def arm() -> TissueModel:
+def load_arm() -> TissueModel:
     """The tissue of the scene ``upper_arm``."""
     scene = load_scene("upper_arm")
-    return tissue_model_of(scene, volume_of(scene))
+    return build_tissue_model(scene, load_volume(scene))
 
 
 @dataclass(frozen=True)
-class Motion:
+class ArmMotion:
     """A motion on the arm."""
 
     kind: str  # of `us_sim.evaluation.hand.hand_motion.KINDS`
@@ -61,38 +61,38 @@ class Motion:
     @cached_property
     def poses(self) -> list[Pose]:
         """One pose a frame, those of the approach first."""
-        return hand_motion(self.kind, self.haste, self.seed, self.duration)
+        return make_hand_motion(self.kind, self.haste, self.seed, self.duration)
 
 
-def motions(quick: bool, seed: int) -> list[Motion]:
+def list_motions(quick: bool, seed: int) -> list[ArmMotion]:
     """All motions that are measured: the free hand in every haste, others in the middle one."""
     if quick:
         return [
-            Motion("free", "brisk", seed, 2.0),
-            Motion("free", "violent", seed, 0.7),
-            Motion("tilting", "brisk", seed, 0.7),
+            ArmMotion("free", "brisk", seed, 2.0),
+            ArmMotion("free", "violent", seed, 0.7),
+            ArmMotion("tilting", "brisk", seed, 0.7),
         ]
-    found = [Motion("free", haste, seed, 8.0) for haste in HASTES]
-    return found + [Motion(kind, "brisk", seed, 4.0) for kind in KINDS if kind != "free"]
+    found = [ArmMotion("free", haste, seed, 8.0) for haste in HASTES]
+    return found + [ArmMotion(kind, "brisk", seed, 4.0) for kind in KINDS if kind != "free"]
 
 
 @dataclass(frozen=True, eq=False)
-class Converged:
+class ConvergedAnswer:
     """The converged answer at each of K poses."""
 
     nodes: _Array  # (K, N, 3) m
     residual: _Array  # (K,) as the solver said in the end
 
 
-def converged(model: TissueModel, poses: Sequence[Pose]) -> Converged:
+def follow_to_convergence(model: TissueModel, poses: Sequence[Pose]) -> ConvergedAnswer:
     """Follow the poses, each to convergence."""
     solver = create_solver(METHOD, model, **TISSUE_METHODS[METHOD].patient)
-    found = [_settled(solver, pose) for pose in poses]
+    found = [_settle_at(solver, pose) for pose in poses]
     nodes = np.array([deformation.nodes for deformation in found])
-    return Converged(nodes, np.array([deformation.residual for deformation in found]))
+    return ConvergedAnswer(nodes, np.array([deformation.residual for deformation in found]))
 
 
-def _settled(solver: TissueSolver, pose: Pose) -> Deformation:
+def _settle_at(solver: TissueSolver, pose: Pose) -> Deformation:
     """The best of up to 20 frames at one pose: until it settles, or goes no further.
 
     Of frames in balance the last is the best: in the earlier ones the probe is still sunk in. It
@@ -110,7 +110,7 @@ def _settled(solver: TissueSolver, pose: Pose) -> Deformation:
     return best[-1]
 
 
-class Frame(NamedTuple):
+class FollowedFrame(NamedTuple):
     """One frame of a motion; an error is NaN where there is no converged answer."""
 
     number: int  # of the pose
@@ -121,7 +121,9 @@ class Frame(NamedTuple):
     wall: float  # ms
 
 
-def follow(solver: TissueSolver, motion: Motion, answer: Converged) -> dict[str, Any]:
+def follow_motion(
+    solver: TissueSolver, motion: ArmMotion, answer: ConvergedAnswer
+) -> dict[str, Any]:
     """Follow a motion twice from rest, once with every pose and once live.
 
     Args:
@@ -130,42 +132,44 @@ def follow(solver: TissueSolver, motion: Motion, answer: Converged) -> dict[str,
         answer: the converged one at each of its poses.
 
     Returns:
-        The row, with both tables of `Frame`s.
+        The row, with both tables of `FollowedFrame`s.
 
     Raises:
         FloatingPointError: nodes that the solver returned are not finite.
     """
-    frames, live = _every_pose(solver, motion, answer), _live(solver, motion, answer)
+    frames, live = _follow_every_pose(solver, motion, answer), _follow_live(solver, motion, answer)
     return {
         "frames": len(frames),
-        **_percentiles("error_mm", frames["error"], (50, 95, 99, 100)),
+        **_name_percentiles("error_mm", frames["error"], (50, 95, 99, 100)),
         "not_compared": int(frames["error"].isna().sum()),
-        **_percentiles("residual", frames["residual"], (50, 99, 100)),
+        **_name_percentiles("residual", frames["residual"], (50, 99, 100)),
         **{
             f"residual_over_{limit:g}": float((frames["residual"] > limit).mean())
             for limit in (1e-2, 0.1, 1.0)
         },
         "frames_inverted": int((frames["inverted"] > 0).sum()),
-        **_percentiles("cpu_ms", frames["cpu"], (50, 99, 100)),
-        **_percentiles("wall_ms", frames["wall"], (50, 99, 100)),
+        **_name_percentiles("cpu_ms", frames["cpu"], (50, 99, 100)),
+        **_name_percentiles("wall_ms", frames["wall"], (50, 99, 100)),
         "live_skipped": 1.0 - len(live) / (len(motion.poses) - BEGINS),
-        **_percentiles("live_error_mm", live["error"], (50, 100)),
-        "live_away_ms": longest_away(live),
-        **_percentiles("live_latency_ms", live["latency"], (50, 99, 100)),
+        **_name_percentiles("live_error_mm", live["error"], (50, 100)),
+        "live_away_ms": compute_longest_away(live),
+        **_name_percentiles("live_latency_ms", live["latency"], (50, 99, 100)),
         "live_frames_inverted": int((live["inverted"] > 0).sum()),
         "every": frames,
         "live": live,
     }
 
 
-def _percentiles(name: str, values: pd.Series[float], percents: Sequence[int]) -> dict[str, object]:
+def _name_percentiles(
+    name: str, values: pd.Series[float], percents: Sequence[int]
+) -> dict[str, object]:
     """By column: ``name_p50``, and ``name_worst`` for 100."""
     return {
         f"{name}_{'worst' if p == 100 else f'p{p}'}": values.quantile(p / 100) for p in percents
     }
 
 
-def longest_away(live: pd.DataFrame) -> float:
+def compute_longest_away(live: pd.DataFrame) -> float:
     """The longest time (ms) that a node is shown farther than `AWAY` from where it belongs."""
     number = live["number"].to_numpy()
     longest, lasted = 0, 0  # poses
@@ -176,23 +180,25 @@ def longest_away(live: pd.DataFrame) -> float:
     return 1e3 * longest / RATE
 
 
-def _every_pose(solver: TissueSolver, motion: Motion, answer: Converged) -> pd.DataFrame:
+def _follow_every_pose(
+    solver: TissueSolver, motion: ArmMotion, answer: ConvergedAnswer
+) -> pd.DataFrame:
     """Leave no pose out, however long a frame takes."""
     solver.reset()
-    rows = [_frame(solver, motion, answer, k) for k in range(len(motion.poses))]
-    return pd.DataFrame(rows[BEGINS:], columns=Frame._fields)
+    rows = [_measure_frame(solver, motion, answer, k) for k in range(len(motion.poses))]
+    return pd.DataFrame(rows[BEGINS:], columns=FollowedFrame._fields)
 
 
-def _live(solver: TissueSolver, motion: Motion, answer: Converged) -> pd.DataFrame:
+def _follow_live(solver: TissueSolver, motion: ArmMotion, answer: ConvergedAnswer) -> pd.DataFrame:
     """Take poses at their times, each frame the newest of them; with the ``latency``, ms.
 
     The clock is the wall's while a frame is made; waiting for a pose takes no time. A frame may
-    take as long as `Pace` says, as in the node, which needs 0.5 ms to send its result.
+    take as long as `FramePace` says, as in the node, which needs 0.5 ms to send its result.
     """
     solver.reset()
     rows: list[dict[str, float]] = []
     now, done = 0.0, -1
-    pace = Pace(sending=0.0005)
+    pace = FramePace(sending=0.0005)
     while done < len(motion.poses) - 1:
         newest = int(now * RATE + 1e-9)
         if newest <= done:
@@ -200,9 +206,9 @@ def _live(solver: TissueSolver, motion: Motion, answer: Converged) -> pd.DataFra
         if newest >= len(motion.poses):
             break
         solver.frame_limit = pace.limit
-        row = _frame(solver, motion, answer, newest)
+        row = _measure_frame(solver, motion, answer, newest)
         now += 1e-3 * row.wall
-        pace.spend(1e-3 * row.wall)
+        pace.count_frame(1e-3 * row.wall)
         done = newest
         rows.append({**row._asdict(), "latency": 1e3 * (now - newest / RATE)})
     solver.frame_limit = None
@@ -210,7 +216,9 @@ def _live(solver: TissueSolver, motion: Motion, answer: Converged) -> pd.DataFra
     return frames[frames["number"] >= BEGINS].reset_index(drop=True)
 
 
-def _frame(solver: TissueSolver, motion: Motion, answer: Converged, k: int) -> Frame:
+def _measure_frame(
+    solver: TissueSolver, motion: ArmMotion, answer: ConvergedAnswer, k: int
+) -> FollowedFrame:
     begun, processor = time.perf_counter(), time.process_time()
     found = solver.deform(motion.poses[k])
     processor, wall = time.process_time() - processor, time.perf_counter() - begun
@@ -220,22 +228,24 @@ def _frame(solver: TissueSolver, motion: Motion, answer: Converged, k: int) -> F
     if answer.residual[k] <= TRUSTED:
         error = float(np.linalg.norm(found.nodes - answer.nodes[k], axis=1).max())
     inverted = signed_volumes(found.nodes, solver.model.mesh.tetrahedra) <= 0
-    return Frame(k, 1e3 * error, found.residual, int(inverted.sum()), 1e3 * processor, 1e3 * wall)
+    return FollowedFrame(
+        k, 1e3 * error, found.residual, int(inverted.sum()), 1e3 * processor, 1e3 * wall
+    )
 
 
 @lru_cache(1)
-def _answer(motion: Motion) -> Converged:
-    return converged(arm(), motion.poses)
+def _compute_answer(motion: ArmMotion) -> ConvergedAnswer:
+    return follow_to_convergence(load_arm(), motion.poses)
 
 
 @cache
-def _solver(method: str) -> TissueSolver:
-    solver = create_solver(method, arm())
+def _make_solver(method: str) -> TissueSolver:
+    solver = create_solver(method, load_arm())
     solver.warm_up()
     return solver
 
 
-def motion_rows(motion: Motion, method: str) -> list[dict[str, Any]]:
+def measure_motion(motion: ArmMotion, method: str) -> list[dict[str, Any]]:
     """Row of a method; the answer of the last motion is kept, and the solvers."""
     with threadpool_limits(1):
-        return [follow(_solver(method), motion, _answer(motion))]
+        return [follow_motion(_make_solver(method), motion, _compute_answer(motion))]

@@ -9,7 +9,7 @@ import pandas as pd
 
 from us_sim.evaluation.figures import draw_error_over_time
 from us_sim.evaluation.hand.hand_motion import KINDS, RATE
-from us_sim.evaluation.hand.measure import motion_rows, motions
+from us_sim.evaluation.hand.measure import list_motions, measure_motion
 from us_sim.evaluation.settings import HandSettings
 from us_sim.evaluation.subject import Piece, Report, Subject, Target
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
@@ -17,20 +17,22 @@ from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 JUDGED = "fem_nonlinear"  # the method that the targets are for
 
 
-def _pieces(quick: bool, settings: HandSettings | None = None) -> Mapping[str, Sequence[Piece]]:
+def _plan_pieces(
+    quick: bool, settings: HandSettings | None = None
+) -> Mapping[str, Sequence[Piece]]:
     return {
         "hand": [
             Piece(
                 {"kind": motion.kind, "haste": motion.haste, "seed": motion.seed, "method": method},
-                partial(motion_rows, motion, method),
+                partial(measure_motion, motion, method),
             )
-            for motion in motions(quick, (settings or HandSettings()).seed)
+            for motion in list_motions(quick, (settings or HandSettings()).seed)
             for method in TISSUE_METHODS
         ]
     }
 
 
-def _joined(table: pd.DataFrame, frames: str) -> pd.DataFrame:
+def _join_frames(table: pd.DataFrame, frames: str) -> pd.DataFrame:
     """Every frame of some rows, with the row's motion and method."""
     rows = [
         row[frames].assign(motion=row["motion"], method=row["method"])
@@ -46,7 +48,7 @@ def _report(table: pd.DataFrame) -> Report:
     judged = table[table["method"] == JUDGED]
     brisk = table[table["haste"] == "brisk"]
     mine = brisk[brisk["method"] == JUDGED]
-    every, live = _joined(mine, "every"), _joined(mine, "live")
+    every, live = _join_frames(mine, "every"), _join_frames(mine, "live")
     balanced = 100 * (every["residual"] <= 1e-2).mean()
     wrong = (judged["frames_inverted"] + judged["live_frames_inverted"]).sum()
     late, skipped = live["latency"].quantile(0.99), 100 * mine["live_skipped"].mean()
@@ -65,9 +67,9 @@ def _report(table: pd.DataFrame) -> Report:
         *(Target.at_most(*limit) for limit in limits),
     ]
     free = table[table["kind"] == "free"]
-    frames = _joined(table, "every")
+    frames = _join_frames(table, "every")
     inverted = frames.groupby("method", sort=False)["inverted"].apply(lambda n: (n > 0).mean())
-    linear = _joined(brisk[brisk["method"] == "fem"], "every")
+    linear = _join_frames(brisk[brisk["method"] == "fem"], "every")
     take_home = [
         f"In a brisk hand on the arm `{JUDGED}` is {every['error'].median():.2g} mm off where it "
         f"is worst (median frame; {every['error'].quantile(0.99):.2g} mm at the 99th percentile), "
@@ -114,7 +116,7 @@ def _report(table: pd.DataFrame) -> Report:
 HAND = Subject(
     "hand",
     "A hand: error, residual and run time of every method",
-    _pieces,
+    _plan_pieces,
     _report,
     hidden=("every", "live"),
 )

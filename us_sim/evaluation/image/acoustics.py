@@ -1,8 +1,8 @@
 """Loss along beams and the edges of shadows in images, against closed forms.
 
->>> from us_sim.evaluation.image.acoustics import lost
+>>> from us_sim.evaluation.image.acoustics import compute_loss
 >>> down = np.array([0.0, 0.0, 1.0])
->>> float(lost(np.zeros(3), down, np.array([0.01]), 5e6)[0].round(3))  # 1 cm of liver
+>>> float(compute_loss(np.zeros(3), down, np.array([0.01]), 5e6)[0].round(3))  # 1 cm of liver
 -4.5
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from us_sim.evaluation.image.measure import row_of, tilted
+from us_sim.evaluation.image.measure import make_row, make_tilted_pose
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.acoustics.settings import Acoustics, TissueAcoustics
 from us_sim.slicing.b_mode import BMode
@@ -39,10 +39,10 @@ LAYERS = {
 _live = partial(Acoustics, artefacts="live", surfaces=False)
 
 
-def attenuation_rows(quick: bool) -> Iterator[dict[str, Any]]:
+def measure_attenuation(quick: bool) -> Iterator[dict[str, Any]]:
     """Images of layers of one grey, whose levels are the loss alone; the worst depth of each."""
     begins = [begin for begin, *_ in LAYERS.values()]
-    volume = _volume_of(
+    volume = _make_volume(
         LAYERS,
         (4e-3, 4e-3, 0.1e-3),
         ((-0.16, 0.16), (-0.16, 0.16), (-0.06, 0.11)),
@@ -62,14 +62,14 @@ def attenuation_rows(quick: bool) -> Iterator[dict[str, Any]]:
         scanner = BMode(volume, probe, acoustics=acoustics)
         for degrees in (0.0, 40.0) if quick else (0.0, 10.0, 20.0, 30.0, 40.0):
             for elevational in (False, True) if degrees else (False,):
-                pose = tilted(degrees, elevational=elevational)
-                expected = _expected_levels(probe, pose, acoustics)
-                depth, known, shown = _worst_depth(probe, scanner.image(pose), expected)
+                pose = make_tilted_pose(degrees, elevational=elevational)
+                expected = _compute_expected_levels(probe, pose, acoustics)
+                depth, known, shown = _find_worst_depth(probe, scanner.render_image(pose), expected)
                 artefact = "attenuation" + ("_elevational" if elevational else "")
-                yield row_of(artefact, name, degrees, depth, known, shown, "dB")
+                yield make_row(artefact, name, degrees, depth, known, shown, "dB")
 
 
-def lost(start: Array, direction: Array, distance: Array, frequency: float) -> Array:
+def compute_loss(start: Array, direction: Array, distance: Array, frequency: float) -> Array:
     """dB by which echoes at distances (…,) m along beams are changed (Beer and Lambert).
 
     Args:
@@ -91,20 +91,20 @@ def lost(start: Array, direction: Array, distance: Array, frequency: float) -> A
     return level
 
 
-def _expected_levels(probe: Probe, pose: Pose, acoustics: Acoustics) -> Array:
+def _compute_expected_levels(probe: Probe, pose: Pose, acoustics: Acoustics) -> Array:
     """(rows, columns) dB by which each pixel is changed; NaN where no beam reaches."""
     assert acoustics.frequency is not None
     line, distance = probe.pixel_beams.astype(np.float64)
-    starts, directions = probe.rays(((line + 0.5) / probe.lines).reshape(-1))
-    start = pose.apply(np.insert(starts, 1, 0.0, axis=1))
+    starts, directions = probe.compute_rays(((line + 0.5) / probe.lines).reshape(-1))
+    start = pose.transform_points(np.insert(starts, 1, 0.0, axis=1))
     direction = np.insert(directions, 1, 0.0, axis=1) @ pose.rotation.T
     away = distance.reshape(-1)
-    level = lost(start, direction, away, acoustics.frequency)
+    level = compute_loss(start, direction, away, acoustics.frequency)
     level += 2.0 * 100.0 * acoustics.compensation * acoustics.frequency * 1e-6 * away
     return np.asarray(level.reshape(line.shape))
 
 
-def _worst_depth(
+def _find_worst_depth(
     probe: Probe, image: NDArray[np.uint8], expected: Array
 ) -> tuple[float, float, float]:
     """Depth (m) with the greatest error of its mean, and that mean: expected and shown, dB."""
@@ -133,10 +133,10 @@ STATES = {
 """Gradients (3, 3) of the deformation around the bone, and m by which the probe is slid along x."""
 
 
-def shadow_rows(quick: bool) -> Iterator[dict[str, Any]]:
+def measure_shadows(quick: bool) -> Iterator[dict[str, Any]]:
     """A shadow of bone at rest, pressed, and as the probe slides: half of the amplitude is left."""
     (left, right), (top, bottom) = BLOCK
-    volume = _volume_of(
+    volume = _make_volume(
         ("muscle", "bone"),
         (0.2e-3, 4e-3, 0.2e-3),
         ((-0.09, 0.09), (-0.02, 0.02), (-0.05, 0.09)),
@@ -158,30 +158,30 @@ def shadow_rows(quick: bool) -> Iterator[dict[str, Any]]:
     for name, (probe, frequency) in probes.items():
         acoustics = _live(frequency=frequency, compensation=0.57, tissues=tissues)
         scanner = BMode(volume, probe, acoustics=acoustics)
-        scanner.carry(carrier.nodes, carrier.tetrahedra)
+        scanner.attach_mesh(carrier.nodes, carrier.tetrahedra)
         for degrees in (0.0, 15.0) if quick else (-20.0, -10.0, 0.0, 10.0, 20.0):
             for state, (gradient, slid) in STATES.items():
-                pose = Pose(np.array([slid, 0.0, 0.0]), tilted(degrees).orientation)
-                image = scanner.image(pose, carrier.nodes @ gradient.T)
-                places = _places_of(probe, pose, corners @ gradient.T)
+                pose = Pose(np.array([slid, 0.0, 0.0]), make_tilted_pose(degrees).orientation)
+                image = scanner.render_image(pose, carrier.nodes @ gradient.T)
+                places = _find_beams(probe, pose, corners @ gradient.T)
                 for depth in (0.6 * probe.depth, 0.75 * probe.depth, 0.9 * probe.depth):
-                    for edges in _edges(probe, image, places, depth):
-                        yield row_of(f"shadow_edge_{state}", name, degrees, depth, *edges, "px")
+                    for edges in _find_edges(probe, image, places, depth):
+                        yield make_row(f"shadow_edge_{state}", name, degrees, depth, *edges, "px")
 
 
-def _places_of(probe: Probe, pose: Pose, points: Array) -> Array:
+def _find_beams(probe: Probe, pose: Pose, points: Array) -> Array:
     """(n,) place among all beams, 0 to 1, of those through points (n, 3) m, by bisection."""
     x, _, z = ((points - pose.position) @ pose.rotation).T
     low, high = np.zeros(len(x)), np.ones(len(x))
     for _ in range(50):
         middle = 0.5 * (low + high)
-        starts, directions = probe.rays(middle)
+        starts, directions = probe.compute_rays(middle)
         side = (x - starts[:, 0]) * directions[:, 1] - (z - starts[:, 1]) * directions[:, 0]
         low, high = np.where(side > 0, middle, low), np.where(side > 0, high, middle)
     return 0.5 * (low + high)
 
 
-def _edges(
+def _find_edges(
     probe: Probe, image: NDArray[np.uint8], places: Array, depth: float
 ) -> Iterator[tuple[float, float]]:
     """Both edges of a shadow at a depth, expected and shown: pixels from the middle, on the arc."""
@@ -194,7 +194,7 @@ def _edges(
     number = np.maximum(np.bincount(bins, minlength=count), 1)
     mean = np.bincount(bins, amplitude, minlength=count) / number
     centre = np.bincount(bins, place, minlength=count) / number
-    starts, directions = probe.rays(np.linspace(0.0, 1.0, 129))
+    starts, directions = probe.compute_rays(np.linspace(0.0, 1.0, 129))
     chords = np.diff(starts + depth * directions, axis=0)
     pixels = float(np.linalg.norm(chords, axis=1).sum() / probe.pixel_spacing[0])
     dark = np.flatnonzero(mean < 0.5)
@@ -208,7 +208,7 @@ def _edges(
             yield pixels * (expected - 0.5), pixels * (found - 0.5)
 
 
-def _volume_of(
+def _make_volume(
     names: Sequence[str] | Mapping[str, Any],
     voxel: tuple[float, float, float],
     extent: Sequence[tuple[float, float]],

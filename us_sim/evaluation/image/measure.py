@@ -1,7 +1,7 @@
 """Rows of image.csv, the arm at five tilts, and the run time of its images.
 
->>> from us_sim.evaluation.image.measure import row_of
->>> round(row_of("attenuation", "linear", 20.0, 0.01, -6.0, -6.1, "dB")["error_percent"], 2)
+>>> from us_sim.evaluation.image.measure import make_row
+>>> round(make_row("attenuation", "linear", 20.0, 0.01, -6.0, -6.1, "dB")["error_percent"], 2)
 -1.14
 """
 
@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from us_sim.evaluation.timing import medians_in_turn
+from us_sim.evaluation.timing import time_in_turn
 from us_sim.geometry.pose import Pose
-from us_sim.scene.building import probe_of, volume_of
+from us_sim.scene.building import build_probe, load_volume
 from us_sim.scene.reading import load_scene
 from us_sim.slicing.acoustics.settings import Acoustics
 from us_sim.slicing.b_mode import BMode
@@ -27,7 +27,7 @@ from us_sim.slicing.strain import AxialStrain
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 
 
-def row_of(
+def make_row(
     artefact: str,
     probe: str,
     tilt: float,
@@ -59,21 +59,23 @@ def row_of(
     }
 
 
-def tilted(degrees: float, *, elevational: bool = False) -> Pose:
+def make_tilted_pose(degrees: float, *, elevational: bool = False) -> Pose:
     """A probe at the origin, turned about y in its image's plane, or about x out of it."""
     turn = Rotation.from_euler("x" if elevational else "y", degrees, degrees=True)
     return Pose(np.zeros(3), turn.as_quat())
 
 
-def arm_images() -> dict[str, dict[str, NDArray[np.uint8]]]:
+def make_arm_images() -> dict[str, dict[str, NDArray[np.uint8]]]:
     """Images by what they show, and by the tilt of a probe that turns about the bone."""
     scene = load_scene("upper_arm")
-    volume, side = volume_of(scene), 320
-    deep: Any = probe_of(scene)
+    volume, side = load_volume(scene), 320
+    deep: Any = build_probe(scene)
     probe = dataclasses.replace(deep, depth=0.054).with_pixels(side, round(1.35 * side))
     full = scene.imaging.acoustics
     bone, from_bone = np.array([12e-3, 0.0, 38e-3]), np.array([-6e-3, 0.0, -36e-3])  # m
-    turns = {f"{degrees:g}°": tilted(degrees) for degrees in (-20.0, -10.0, 0.0, 10.0, 20.0)}
+    turns = {
+        f"{degrees:g}°": make_tilted_pose(degrees) for degrees in (-20.0, -10.0, 0.0, 10.0, 20.0)
+    }
     found = {}
     for name, acoustics in (
         ("all artefacts", full),
@@ -82,16 +84,16 @@ def arm_images() -> dict[str, dict[str, NDArray[np.uint8]]]:
     ):
         scanner = BMode(volume, probe, Imaging(), acoustics)
         found[name] = {
-            tilt: scanner.image(Pose(bone + turned.rotation @ from_bone, turned.orientation))
+            tilt: scanner.render_image(Pose(bone + turned.rotation @ from_bone, turned.orientation))
             for tilt, turned in turns.items()
         }
     return found
 
 
-def run_time_rows(quick: bool) -> Iterator[dict[str, Any]]:
+def measure_run_times(quick: bool) -> Iterator[dict[str, Any]]:
     """Images of 512 × 512 of the pressed arm, in turn, so that all have the same disturbances."""
     scene = load_scene("upper_arm")
-    volume, probe = volume_of(scene), probe_of(scene).with_pixels(512, 512)
+    volume, probe = load_volume(scene), build_probe(scene).with_pixels(512, 512)
     full = scene.imaging.acoustics
     none = dataclasses.replace(full, surfaces=False, anisotropy=False, noise=None)
     kinds: dict[str, Acoustics | None] = {
@@ -109,23 +111,23 @@ def run_time_rows(quick: bool) -> Iterator[dict[str, Any]]:
     nodes[:, 2] += press * np.exp(-(x**2 + y**2) / 0.02**2) * (1.0 - z / 0.054)
     strain = AxialStrain(mesh.nodes, mesh.tetrahedra)
 
-    def shown(acoustics: Acoustics | None, with_strain: bool) -> Callable[[Pose], object]:
+    def make_imager(acoustics: Acoustics | None, with_strain: bool) -> Callable[[Pose], object]:
         scanner = BMode(volume, probe, Imaging(), acoustics)
-        scanner.carry(mesh.nodes, mesh.tetrahedra)
+        scanner.attach_mesh(mesh.nodes, mesh.tetrahedra)
 
-        def show(pose: Pose) -> None:
-            frame = scanner.frame(pose, nodes)
+        def make_image(pose: Pose) -> None:
+            frame = scanner.make_frame(pose, nodes)
             _ = frame.pixels
             if with_strain:
-                strain.image(frame)
+                strain.compute_strain(frame)
 
-        return show
+        return make_image
 
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        medians = medians_in_turn(
-            {name: shown(acoustics, name == "strain") for name, acoustics in kinds.items()},
+        medians = time_in_turn(
+            {name: make_imager(acoustics, name == "strain") for name, acoustics in kinds.items()},
             60 if quick else 300,
             5,
             prepare=lambda number: Pose(np.array([2e-4 * (number % 7), 0.0, press])),
@@ -133,4 +135,4 @@ def run_time_rows(quick: bool) -> Iterator[dict[str, Any]]:
     finally:
         cv2.setNumThreads(threads)
     for name, ms in medians.items():
-        yield row_of(f"run_time_{name}", "linear", np.nan, np.nan, np.nan, ms, "ms")
+        yield make_row(f"run_time_{name}", "linear", np.nan, np.nan, np.nan, ms, "ms")

@@ -9,18 +9,18 @@ from typing import Any
 import pandas as pd
 
 from us_sim.evaluation.figures import draw_image_grid
-from us_sim.evaluation.image.acoustics import STATES, attenuation_rows, shadow_rows
-from us_sim.evaluation.image.measure import arm_images, run_time_rows
+from us_sim.evaluation.image.acoustics import STATES, measure_attenuation, measure_shadows
+from us_sim.evaluation.image.measure import make_arm_images, measure_run_times
 from us_sim.evaluation.subject import Piece, Report, Subject, Target
 
 ARTEFACTS: Mapping[str, Callable[[bool], Iterable[Mapping[str, Any]]]] = {
-    "attenuation": attenuation_rows,
-    "shadow_edge": shadow_rows,
-    "run_time": run_time_rows,
+    "attenuation": measure_attenuation,
+    "shadow_edge": measure_shadows,
+    "run_time": measure_run_times,
 }
 
 
-def _pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
+def _plan_pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
     return {
         "image": [
             Piece({"artefact": name}, partial(rows, quick)) for name, rows in ARTEFACTS.items()
@@ -28,23 +28,23 @@ def _pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
     }
 
 
-def report_of(table: pd.DataFrame) -> Report:
+def report_image(table: pd.DataFrame) -> Report:
     """What the table says of sound; what failed is not known."""
     table = table.assign(off=(table["measured"] - table["expected"]).abs())
 
-    def worst(artefact: str, column: str) -> float:
+    def find_worst(artefact: str, column: str) -> float:
         rows = table[table["artefact"].str.startswith(artefact)]
         return float(rows[column].abs().max())
 
-    loss = worst("attenuation", "error_percent")
-    ms = {kind: worst(f"run_time_{kind}", "measured") for kind in ("slice", "strain", "all")}
+    loss = find_worst("attenuation", "error_percent")
+    ms = {kind: find_worst(f"run_time_{kind}", "measured") for kind in ("slice", "strain", "all")}
     limits: Sequence[tuple[str, float, float, str]] = (
         ("loss in layers, tilted up to 40°: amplitude, worst depth", 1.0, loss, "%"),
         *(
             (
                 f"shadow of bone, {state}: pixels from its geometric edge, worst",
                 1.0,
-                worst(f"shadow_edge_{state}", "off"),
+                find_worst(f"shadow_edge_{state}", "off"),
                 "",
             )
             for state in STATES
@@ -55,14 +55,14 @@ def report_of(table: pd.DataFrame) -> Report:
     )
     take_home = [
         f"Loss through layers is {loss:.2g} % off in amplitude at worst.",
-        f"A shadow's edge is {worst('shadow_edge', 'off'):.2g} pixels off, at rest and pressed.",
+        f"A shadow's edge is {find_worst('shadow_edge', 'off'):.2g} pixels off, at rest and pressed.",
         f"An image of 512 × 512 takes {ms['slice']:.2f} ms of a core, with strain "
         f"{ms['strain']:.2f} ms, with all acoustics {ms['all']:.2f} ms.",
     ]
     timed = table[table["unit"] == "ms"]
     closed = table[table["unit"] != "ms"]
     places = {
-        "arm_tilts": draw_image_grid(arm_images(), "The arm at five tilts"),
+        "arm_tilts": draw_image_grid(make_arm_images(), "The arm at five tilts"),
         "errors": closed.pivot_table("off", ["artefact", "unit"], "probe", "max", sort=False)
         .reset_index()
         .rename_axis(columns=None),
@@ -80,7 +80,7 @@ def report_of(table: pd.DataFrame) -> Report:
 IMAGE = Subject(
     "image",
     "Image: sound against closed forms",
-    _pieces,
-    report_of,
+    _plan_pieces,
+    report_image,
     libraries=("opencv-python-headless", "opencv-python"),
 )

@@ -26,7 +26,7 @@ HOPS = {
 _HEADER = struct.Struct("<4xiI")  # where a serialized message with a header has its stamp
 
 
-def stamp_of(data: bytes) -> int:
+def read_stamp(data: bytes) -> int:
     """The stamp, ns, of a serialized message with a header."""
     seconds, nanoseconds = _HEADER.unpack_from(data)
     return int(1_000_000_000 * seconds + nanoseconds)
@@ -39,20 +39,20 @@ class Arrivals(Node):  # type: ignore[misc]
         super().__init__("arrivals", **kwargs)
         self._heard: dict[str, list[tuple[int, int]]] = {topic: [] for topic in HOPS}
         for topic, kind in HOPS.items():
-            note = partial(self._note, self._heard[topic])
+            note = partial(self._record_arrival, self._heard[topic])
             self.create_subscription(kind, topic, note, EVERY, raw=True)
 
-    def heard(self, topic: str) -> Sequence[tuple[int, int]]:
+    def list_arrivals(self, topic: str) -> Sequence[tuple[int, int]]:
         """Stamp and time of arrival of every message so far, ns."""
         return list(self._heard[topic])
 
-    def heard_between(self, began: int, ended: int) -> dict[str, list[tuple[int, int]]]:
+    def list_arrivals_between(self, began: int, ended: int) -> dict[str, list[tuple[int, int]]]:
         """Stamps and arrivals by topic, of messages stamped from ``began`` until ``ended``, ns."""
         return {
-            topic: [each for each in self.heard(topic) if began <= each[0] < ended]
+            topic: [each for each in self.list_arrivals(topic) if began <= each[0] < ended]
             for topic in self._heard
         }
 
     @staticmethod
-    def _note(heard: list[tuple[int, int]], data: bytes) -> None:
-        heard.append((stamp_of(data), time.time_ns()))
+    def _record_arrival(heard: list[tuple[int, int]], data: bytes) -> None:
+        heard.append((read_stamp(data), time.time_ns()))

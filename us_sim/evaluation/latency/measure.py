@@ -1,7 +1,7 @@
 """Run the arm in many ways, one thing changed at a time, and listen to its graph.
 
->>> from us_sim.evaluation.latency.measure import cases
->>> [str(case) for case in cases(quick=True)][:2]
+>>> from us_sim.evaluation.latency.measure import list_cases
+>>> [str(case) for case in list_cases(quick=True)][:2]
 ['fem, 512x512, recorder', 'fem_nonlinear, 512x512, recorder']
 """
 
@@ -20,14 +20,19 @@ from typing import Any
 
 import numpy as np
 
-from us_sim.evaluation.processes import UsageOverTime, listening, simulating, started_by
-from us_sim.evaluation.report import percentile
+from us_sim.evaluation.processes import (
+    UsageOverTime,
+    find_descendants,
+    record_arrivals,
+    run_simulator,
+)
+from us_sim.evaluation.report import compute_percentile
 from us_sim.recording.reader import read_bag
 from us_sim.share import find_bag
 
 
 @dataclass(frozen=True)
-class Case:
+class LatencyCase:
     """One way to run the scene ``upper_arm``."""
 
     solver: str = "fem"
@@ -47,13 +52,13 @@ class Case:
         return ", ".join(word for word, is_said in words.items() if is_said)
 
 
-DEMO = Case("fem_nonlinear", seconds=130.0)  # the method of the demo
+DEMO = LatencyCase("fem_nonlinear", seconds=130.0)  # the method of the demo
 BUSY = replace(DEMO, cores_busy=True, seconds=20.0)
 
 
-def cases(quick: bool) -> list[Case]:
+def list_cases(quick: bool) -> list[LatencyCase]:
     """Cases of a run; a quick one has a few, of some seconds each."""
-    base, ordinary = Case(), replace(BUSY, realtime=False)
+    base, ordinary = LatencyCase(), replace(BUSY, realtime=False)
     if quick:
         return [replace(case, seconds=8.0) for case in (base, DEMO, BUSY, ordinary)]
     return [
@@ -68,13 +73,13 @@ def cases(quick: bool) -> list[Case]:
     ]
 
 
-def run_case(case: Case) -> list[dict[str, Any]]:
+def run_case(case: LatencyCase) -> list[dict[str, Any]]:
     """Run the arm as the case says, and return its row.
 
     Raises:
         UsSimError: the simulation ends, or no image comes.
     """
-    from us_sim.evaluation.latency.arrivals import stamp_of
+    from us_sim.evaluation.latency.arrivals import read_stamp
 
     with tempfile.TemporaryDirectory(prefix="us_sim_latency_") as name:
         scene, session = Path(name) / "scene.yaml", Path(name) / "session.mcap"
@@ -86,31 +91,31 @@ def run_case(case: Case) -> list[dict[str, Any]]:
         words += ["--record", str(session)] if case.recorder else []
         for node in ("probe_tracker", "tissue_deformer", "skin_deformer", "slice_interpolator"):
             words += ["--param", f"{node}.realtime={str(case.realtime).lower()}"]
-        busy = _busy_cores() if case.cores_busy else contextlib.nullcontext()
-        with listening() as arrivals, busy, simulating(*words) as simulation:
-            simulation.await_images(arrivals)
+        busy = _keep_cores_busy() if case.cores_busy else contextlib.nullcontext()
+        with record_arrivals() as arrivals, busy, run_simulator(*words) as simulation:
+            simulation.await_image(arrivals)
             time.sleep(2.0)  # these images do not count
-            pids = {node: pid for pid, node in started_by(simulation.process.pid).items()}
+            pids = {node: pid for pid, node in find_descendants(simulation.process.pid).items()}
             policy = os.sched_getscheduler(pids["tissue_deformer"]) & ~os.SCHED_RESET_ON_FORK
             scheduling = "realtime" if policy == os.SCHED_RR else "ordinary"
             usage = UsageOverTime(simulation.process.pid)
             began, began_ns = time.monotonic(), time.time_ns()
             while time.monotonic() - began < case.seconds:
-                simulation.check()
+                simulation.require_running()
                 usage.update()
                 time.sleep(0.5)
             ended_ns = time.time_ns()
             time.sleep(1.5)  # for messages under way to arrive, and to be recorded
-            heard = arrivals.heard_between(began_ns, ended_ns)
+            heard = arrivals.list_arrivals_between(began_ns, ended_ns)
         recorded = None
         if case.recorder:
-            there = read_bag(session).messages(["/ultrasound/image"])
+            there = read_bag(session).read_messages(["/ultrasound/image"])
             stamps = {stamp for stamp, _ in heard["ultrasound/image"]}
-            recorded = len(stamps & {stamp_of(message.data) for message in there})
-    return [{"scheduling": scheduling, **row_of(heard, recorded, usage.columns())}]
+            recorded = len(stamps & {read_stamp(message.data) for message in there})
+    return [{"scheduling": scheduling, **make_row(heard, recorded, usage.make_columns())}]
 
 
-def row_of(
+def make_row(
     heard: Mapping[str, Sequence[tuple[int, int]]], recorded: int | None, usage: Mapping[str, float]
 ) -> dict[str, Any]:
     """Row of what was heard by topic, in their order, and of the usage.
@@ -129,7 +134,7 @@ def row_of(
     missed = np.setdiff1d(poses, stamps)
     missed = missed[(missed > stamps.min(initial=2**62)) & (missed < stamps.max(initial=0))]
 
-    def of_all(part: str) -> list[float]:
+    def select_usage(part: str) -> list[float]:
         return [value for name, value in usage.items() if name.startswith(part)]
 
     return {
@@ -139,22 +144,22 @@ def row_of(
         "dropped": len(missed),
         "not_recorded": np.nan if recorded is None else float(len(stamps) - recorded),
         **{
-            f"{topic.replace('/', '_')}_ms_{name}": percentile(ages[topic], percent)
+            f"{topic.replace('/', '_')}_ms_{name}": compute_percentile(ages[topic], percent)
             for topic in ages
             if topic != "tracker/pose"
             for name, percent in (("p50", 50), ("p99", 99), ("worst", 100))
         },
-        "image_mm_p50": 0.1 * percentile(age, 50),  # that a hand goes at 0.1 m/s
-        "image_mm_p99": 0.1 * percentile(age, 99),
+        "image_mm_p50": 0.1 * compute_percentile(age, 50),  # that a hand goes at 0.1 m/s
+        "image_mm_p99": 0.1 * compute_percentile(age, 99),
         **{name: value for name, value in usage.items() if name.startswith("cores_")},
-        "cores_all": sum(of_all("cores_")),
-        "memory_mb_all": sum(of_all("memory_mb_")),
-        "growth_mb_a_minute": max(of_all("growth_mb_a_minute_"), default=np.nan),
+        "cores_all": sum(select_usage("cores_")),
+        "memory_mb_all": sum(select_usage("memory_mb_")),
+        "growth_mb_a_minute": max(select_usage("growth_mb_a_minute_"), default=np.nan),
     }
 
 
 @contextlib.contextmanager
-def _busy_cores() -> Iterator[None]:
+def _keep_cores_busy() -> Iterator[None]:
     """Something else that takes all it can get of every core."""
     work = [sys.executable, "-c", "while True: pass"]
     busy = [subprocess.Popen(work) for _ in range(os.cpu_count() or 1)]

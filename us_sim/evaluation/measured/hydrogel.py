@@ -32,10 +32,10 @@ from us_sim.errors import SolverError, UsSimError
 from us_sim.evaluation.figures import draw_error_over_parameter
 from us_sim.evaluation.subject import Piece, Place
 from us_sim.geometry.collider import Sphere
-from us_sim.tissue.elasticity.linear_tetrahedra import lame_stiffness
+from us_sim.tissue.elasticity.linear_tetrahedra import assemble_lame_stiffness
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import uniform_material
-from us_sim.tissue.mesh.embedding import locate
+from us_sim.tissue.elasticity.materials import make_uniform_materials
+from us_sim.tissue.mesh.embedding import locate_points
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.newton import Newton
@@ -86,7 +86,7 @@ def read_beads(file: Path) -> tuple[Array, Array]:
             f"{file}: cannot be read as SerialTrack's results ({error}); fetch it again"
         ) from error
     linked = partners >= 0
-    well = linked & (linked[_neighbours(before)].mean(axis=1) > _WELL_LINKED)
+    well = linked & (linked[_find_neighbours(before)].mean(axis=1) > _WELL_LINKED)
     return before[well], after[partners[well]] - before[well]
 
 
@@ -96,7 +96,7 @@ def grow_links(before: Array, after: Array, links: NDArray[np.int64]) -> NDArray
     Args:
         links: (A,), the seeds.
     """
-    links, neighbours = links.copy(), _neighbours(before)
+    links, neighbours = links.copy(), _find_neighbours(before)
     while True:
         linked = links >= 0
         asked = np.flatnonzero(~linked & (linked[neighbours].sum(axis=1) >= _LEAST_NEIGHBOURS))
@@ -113,7 +113,7 @@ def grow_links(before: Array, after: Array, links: NDArray[np.int64]) -> NDArray
         links[asked[sure]] = left[found[sure]]
 
 
-def _neighbours(places: Array) -> NDArray[np.int64]:
+def _find_neighbours(places: Array) -> NDArray[np.int64]:
     return np.asarray(KDTree(places).query(places, _NEIGHBOURS + 1)[1][:, 1:])
 
 
@@ -137,13 +137,13 @@ class PrescribedBox:
             places, moved, nodes[self.fixed], _NEAREST_AT_FACES, degree=2
         )
         ones = np.ones(len(self.mesh.tetrahedra))
-        matrix = lame_stiffness(self.mesh, -ones, ones).tocsr()  # inside, only mu ga.gb I
+        matrix = assemble_lame_stiffness(self.mesh, -ones, ones).tocsr()  # inside, only mu ga.gb I
         free = np.repeat(~self.fixed, 3)
         pull = (matrix @ self.harmonic.ravel())[free]
         inside = spsolve(matrix[free][:, free].tocsc(), -pull)
         self.harmonic[~self.fixed] = inside.reshape(-1, 3)
 
-    def equilibrium(self, ratio: float, height: float = np.inf) -> Array:
+    def find_equilibrium(self, ratio: float, height: float = np.inf) -> Array:
         """(N, 3) m, of the live solver's model.
 
         Args:
@@ -154,7 +154,7 @@ class PrescribedBox:
             SolverError: it was not found.
         """
         z = self.mesh.nodes[self.mesh.tetrahedra, 2].mean(axis=1)
-        materials = uniform_material(self.mesh, Material(1e3, ratio, 1e3))
+        materials = make_uniform_materials(self.mesh, Material(1e3, ratio, 1e3))
         softer = materials.young_modulus * np.exp((z.min() - z) / height)
         materials, nothing = replace(materials, young_modulus=softer), np.zeros(0, dtype=np.int32)
         newton = Newton(TissueModel(self.mesh, materials, self.fixed, Sphere(0.03), nothing))
@@ -169,14 +169,14 @@ class PrescribedBox:
             f"{goal:.2g} N is asked for; the faces move too far for the mesh"
         )
 
-    def at(self, field: Array, points: Array) -> Array:
+    def interpolate_field(self, field: Array, points: Array) -> Array:
         """(P, 3) m, a nodal field (N, 3) m at points (P, 3) m."""
-        place = locate(self.mesh, points)
+        place = locate_points(self.mesh, points)
         corners = field[self.mesh.tetrahedra[place.tetrahedra]]
         return np.asarray(np.einsum("pa,pad->pd", place.weights, corners))
 
 
-def _length(vectors: Array) -> float:
+def _compute_rms(vectors: Array) -> float:
     """Root of the mean square, in micrometres."""
     return float(np.sqrt((vectors**2).sum(axis=1).mean())) / _MICRON
 
@@ -189,15 +189,18 @@ def predict_beads(file: Path, spacing: float) -> Iterator[dict[str, Any]]:
     known, judged = (depth >= _BAND) & ~side, (depth >= _BAND) & side
     coarse, box = (PrescribedBox(places[near], moved[near], s) for s in (_FITTING_MESH, spacing))
 
-    def misfit(parameters: tuple[float, ...]) -> float:
-        return _length(coarse.at(coarse.equilibrium(*parameters), places[known]) - moved[known])
+    def compute_misfit(parameters: tuple[float, ...]) -> float:
+        return _compute_rms(
+            coarse.interpolate_field(coarse.find_equilibrium(*parameters), places[known])
+            - moved[known]
+        )
 
-    uniform = min(product(_RATIOS), key=misfit)
-    graded = min(product(_RATIOS, _HEIGHTS), key=misfit)
+    uniform = min(product(_RATIOS), key=compute_misfit)
+    graded = min(product(_RATIOS, _HEIGHTS), key=compute_misfit)
     fields = {
         "harmonic": box.harmonic,
-        f"uniform, ν {uniform[0]:g}": box.equilibrium(*uniform),
-        f"graded over {graded[1] / _MICRON:g} µm, ν {graded[0]:g}": box.equilibrium(*graded),
+        f"uniform, ν {uniform[0]:g}": box.find_equilibrium(*uniform),
+        f"graded over {graded[1] / _MICRON:g} µm, ν {graded[0]:g}": box.find_equilibrium(*graded),
     }
     half = np.random.default_rng(1).permutation(len(places)) % 2 == 0
     noise = np.zeros_like(moved)
@@ -210,9 +213,9 @@ def predict_beads(file: Path, spacing: float) -> Iterator[dict[str, Any]]:
                 "case": "all" if low == 0 else f"z {low / _MICRON:.0f} to {high / _MICRON:.0f} um",
                 "quantity": f"rms error, {model}",
                 "unit": "um",
-                "measured": _length(moved[some]),
-                "error": _length(box.at(field, places[some]) - moved[some]),
-                "floor": _length(noise[some]),
+                "measured": _compute_rms(moved[some]),
+                "error": _compute_rms(box.interpolate_field(field, places[some]) - moved[some]),
+                "floor": _compute_rms(noise[some]),
                 "fitted_on": "" if model == "harmonic" else "beads inside, other side of the axis",
                 "line": model,
                 "x": (low + high) / 2 / _MICRON,

@@ -30,7 +30,7 @@ _COMPARED = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.66)
 _HEADING = "Time (s)"
 
 
-def at(compression: float) -> int:
+def find_index(compression: float) -> int:
     """Return the index in `COMPRESSIONS`."""
     return round(compression / _STEP)
 
@@ -93,7 +93,7 @@ def read_silicones(folder: Path) -> list[Silicone]:
     return found
 
 
-def slipping_force(compression: Array) -> Array:
+def compute_slipping_force(compression: Array) -> Array:
     """(C,) m2, force over shear modulus of an incompressible cylinder that slides at the platens.
 
     pi R^2 (1 / l^2 - l), with l = 1 - compression.
@@ -104,8 +104,8 @@ def slipping_force(compression: Array) -> Array:
 
 def fit_modulus(forces: Array) -> float:
     """Pa, the shear modulus that fits forces (C,) N up to 5 % of compression best."""
-    small = slice(1, at(_FITTED) + 1)
-    model = slipping_force(COMPRESSIONS[small])
+    small = slice(1, find_index(_FITTED) + 1)
+    model = compute_slipping_force(COMPRESSIONS[small])
     return float(model @ forces[small] / (model @ model))
 
 
@@ -115,15 +115,15 @@ def predict_silicones(folder: Path) -> Iterator[dict[str, Any]]:
     scatter = np.median([silicone.scatter for silicone in silicones], axis=0)
     errors = []
     for silicone in silicones:
-        predicted = fit_modulus(silicone.first.mean(axis=0)) * slipping_force(COMPRESSIONS)
+        predicted = fit_modulus(silicone.first.mean(axis=0)) * compute_slipping_force(COMPRESSIONS)
         errors.append(predicted / np.maximum(silicone.second.mean(axis=0), 1e-9) - 1)
     for compression in _COMPARED:
         yield {
             "case": f"median of {len(silicones)} silicones",
             "quantity": f"force at {100 * compression:.0f} %",
             "unit": "%",
-            "error": 100 * float(np.median(np.abs(errors), axis=0)[at(compression)]),
-            "floor": 100 * float(scatter[at(compression)]),
+            "error": 100 * float(np.median(np.abs(errors), axis=0)[find_index(compression)]),
+            "floor": 100 * float(scatter[find_index(compression)]),
             "fitted_on": "specimen A: below 5 %",
             "x": 100 * compression,
         }

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from us_sim.evaluation.figures import draw_error_over_parameter
 from us_sim.evaluation.subject import Piece, Place
 from us_sim.geometry.pose import Pose
-from us_sim.scene.building import scanner_of, tissue_model_of, volume_of
+from us_sim.scene.building import build_scanner, build_tissue_model, load_volume
 from us_sim.scene.reading import load_scene
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import create_solver
@@ -55,13 +55,13 @@ elastography of 127 people (Arda et al., 2011), fat and skin by aspiration in vi
 
 
 @dataclass(frozen=True, eq=False)
-class Closing:
+class ClosingCurve:
     """A vein under a probe that is pressed step by step."""
 
     area: Array  # (K,) of the lumen, over that at rest
     pressure: Array  # (K,) mmHg, force over the area that the probe touches
 
-    def at(self, area: float) -> float:
+    def find_pressure(self, area: float) -> float:
         """Find the pressure where the area first falls to this; NaN where it does not."""
         below = np.flatnonzero(self.area <= area)
         if not len(below):
@@ -70,13 +70,15 @@ class Closing:
         return float(np.interp(area, self.area[[k, k - 1]], self.pressure[[k, k - 1]]))
 
 
-def press(venous: float, count: int, moduli: Mapping[str, float] | None = None) -> Closing:
+def press_vein(
+    venous: float, count: int, moduli: Mapping[str, float] | None = None
+) -> ClosingCurve:
     """Press the arm's probe in ``count`` equal steps on the vein with ``venous`` mmHg in it.
 
     ``moduli`` (Pa) take the place of Young's moduli of the scene.
     """
     scene = load_scene("upper_arm")
-    volume = volume_of(scene)
+    volume = load_volume(scene)
     assert scene.tissue is not None
     materials = dict(scene.tissue.materials)
     materials["vein"] = dataclasses.replace(materials["vein"], lumen_pressure=venous * MMHG)
@@ -84,9 +86,9 @@ def press(venous: float, count: int, moduli: Mapping[str, float] | None = None) 
         materials[layer] = dataclasses.replace(materials[layer], young_modulus=young)
     tissue = dataclasses.replace(scene.tissue, materials=materials)
     scene = dataclasses.replace(scene, tissue=tissue)
-    model = tissue_model_of(scene, volume)
-    scanner = scanner_of(scene, volume)
-    scanner.carry(model.mesh.nodes, model.mesh.tetrahedra)
+    model = build_tissue_model(scene, volume)
+    scanner = build_scanner(scene, volume)
+    scanner.attach_mesh(model.mesh.nodes, model.mesh.tetrahedra)
     (label,) = (number for number, name in volume.label_names.items() if name == "vein")
     solver = create_solver("fem_nonlinear", model)
     rows = []
@@ -94,11 +96,11 @@ def press(venous: float, count: int, moduli: Mapping[str, float] | None = None) 
         pose = Pose(np.array([0.0, 0.0, depth]))
         for _ in range(5):
             made = solver.deform(pose)
-        lumen = scanner.labels(pose, made.nodes) == label
+        lumen = scanner.render_labels(pose, made.nodes) == label
         touched = _touched_area(model, made.nodes, made.contact_nodes)
         rows.append((lumen.sum(), np.linalg.norm(made.force) / touched if touched else 0.0))
     area, pressure = np.array(rows, np.float64).T
-    return Closing(area / area[0], pressure / MMHG)
+    return ClosingCurve(area / area[0], pressure / MMHG)
 
 
 def _touched_area(model: TissueModel, nodes: Array, touched: NDArray[np.integer]) -> float:
@@ -112,9 +114,9 @@ def _touched_area(model: TissueModel, nodes: Array, touched: NDArray[np.integer]
 
 def measure_closing(posture: str, moduli: str, count: int) -> Iterator[dict[str, Any]]:
     """Press the vein of a posture shut, and compare the pressures with the published ones."""
-    closing = press(VENOUS[posture], count, MODULI[moduli])
+    closing = press_vein(VENOUS[posture], count, MODULI[moduli])
     low, high = PUBLISHED[posture]
-    middle, pressure = 0.5 * (low + high), closing.at(_CLOSED)
+    middle, pressure = 0.5 * (low + high), closing.find_pressure(_CLOSED)
     yield {
         "case": f"{posture}, moduli {moduli}",
         "quantity": "closing pressure, under the probe",

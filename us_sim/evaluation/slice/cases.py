@@ -1,7 +1,7 @@
 """Images that `us-sim evaluate slice` cuts of a block of speckle.
 
->>> from us_sim.evaluation.slice.cases import MAIN, block, dented
->>> len(block(MAIN.counts).nodes), float(dented(np.zeros((1, 3)), 0.012)[0, 2])
+>>> from us_sim.evaluation.slice.cases import MAIN, block, dent_nodes
+>>> len(block(MAIN.counts).nodes), float(dent_nodes(np.zeros((1, 3)), 0.012)[0, 2])
 (8192, 0.012)
 """
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from us_sim.evaluation.block import EXTENT, LARGEST_MESH, MESHES, block
+from us_sim.evaluation.block import EXTENT, LARGEST_MESH, MESHES, make_block_mesh
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import LinearProbe
@@ -34,7 +34,7 @@ _VOXEL = 0.4e-3  # m
 _WIDTH = 0.022  # m, standard deviation of the dent
 
 
-class View(NamedTuple):
+class PlaneView(NamedTuple):
     """Where the image lies and how it is turned, seen from where the probe stands."""
 
     words: str
@@ -44,14 +44,18 @@ class View(NamedTuple):
 
 
 PLANES = {
-    "straight": View("in the probe's plane"),
-    "oblique": View("turned by 25° and tilted by 30°, from above the skin", 25, 30, (0, 0, -0.01)),
-    "corner": View("turned by 70°, tilted by 40°, out of the block", 70, 40, (0.06, 0.03, 0.01)),
-    "faces": View("along a layer of faces"),
+    "straight": PlaneView("in the probe's plane"),
+    "oblique": PlaneView(
+        "turned by 25° and tilted by 30°, from above the skin", 25, 30, (0, 0, -0.01)
+    ),
+    "corner": PlaneView(
+        "turned by 70°, tilted by 40°, out of the block", 70, 40, (0.06, 0.03, 0.01)
+    ),
+    "faces": PlaneView("along a layer of faces"),
 }
 
 
-class Frame(NamedTuple):
+class SliceFrame(NamedTuple):
     """Nodes and plane of one image."""
 
     nodes: Array  # (N, 3) m, deformed
@@ -59,7 +63,7 @@ class Frame(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Case:
+class SliceCase:
     """An image of the block: how large, on which mesh, how deformed, and on which plane."""
 
     size: int
@@ -67,13 +71,13 @@ class Case:
     deformation: str
     plane: str
 
-    def frames(self, count: int) -> list[Frame]:
+    def make_frames(self, count: int) -> list[SliceFrame]:
         """Images of a trembling probe, so that none repeats the one before."""
-        rest = block(self.counts).nodes
+        rest = make_block_mesh(self.counts).nodes
         depth, view = DEPTHS[self.deformation], PLANES[self.plane]
         found = []
         for number in range(count):
-            nodes = dented(rest, depth * (1.0 - 0.01 * number))
+            nodes = dent_nodes(rest, depth * (1.0 - 0.01 * number))
             position = np.array(view.beside)
             position[2] += depth
             if self.plane == "faces":
@@ -83,14 +87,16 @@ class Case:
                 position += 0.2e-3 * number  # m
             turn = Rotation.from_euler("xz", [view.tilted, view.turned], degrees=True)
             probe = LinearProbe(0.06, 0.08, self.size, self.size)
-            found.append(Frame(nodes, probe.plane(Pose(position, turn.as_quat()))))
+            found.append(SliceFrame(nodes, probe.make_plane(Pose(position, turn.as_quat()))))
         return found
 
 
-MAIN = Case(512, MESHES[-1], "pressed_12mm", "straight")  # the case by which methods are compared
+MAIN = SliceCase(
+    512, MESHES[-1], "pressed_12mm", "straight"
+)  # the case by which methods are compared
 
 
-def cases(quick: bool) -> list[Case]:
+def list_cases(quick: bool) -> list[SliceCase]:
     """All that are cut, the main one first; the quick run leaves most of them out."""
     if quick:
         return [
@@ -112,7 +118,7 @@ def cases(quick: bool) -> list[Case]:
     return list(dict.fromkeys(found))
 
 
-def dented(nodes: Array, depth: float) -> Array:
+def dent_nodes(nodes: Array, depth: float) -> Array:
     """Nodes (N, 3) m of the block pressed by ``depth`` m in the middle of its top.
 
     A smooth field, so that nothing depends on a solver: down under a Gaussian dent that ends at
@@ -126,7 +132,7 @@ def dented(nodes: Array, depth: float) -> Array:
 
 
 @cache
-def speckle() -> Volume:
+def make_speckle() -> Volume:
     """The block's volume, and a little around it: speckle with bright layers."""
     axes = [
         low - _BEYOND + _VOXEL * (np.arange(math.ceil((high - low + 2 * _BEYOND) / _VOXEL)) + 0.5)

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.evaluation.block import block
-from us_sim.evaluation.slice.cases import Case, Frame, speckle
+from us_sim.evaluation.block import make_block_mesh
+from us_sim.evaluation.slice.cases import SliceCase, SliceFrame, make_speckle
 from us_sim.slicing.cutting.slicer import Slicer, create_slicer
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.volume.volume import Volume
@@ -33,12 +33,12 @@ SLICING_METHODS = ((OURS, 1), (OURS, 2), (REFERENCE, 1))
 """Methods and their numbers of threads, in the report's order; VTK is the last, where it is."""
 
 
-def case_rows(case: Case, seconds: float) -> list[dict[str, Any]]:
+def measure_case(case: SliceCase, seconds: float) -> list[dict[str, Any]]:
     """A row for every method, timed together for so many seconds."""
-    volume, mesh, frames = speckle(), block(case.counts), case.frames(4)
+    volume, mesh, frames = make_speckle(), make_block_mesh(case.counts), case.make_frames(4)
     first = frames[0]
     reference = create_slicer(REFERENCE, volume, mesh.nodes, mesh.tetrahedra)
-    exact = reference.image(*first), reference.rest_coordinates(*first)
+    exact = reference.cut_image(*first), reference.compute_rest_coordinates(*first)
     where = volume, mesh.nodes, mesh.tetrahedra
     slicers: list[tuple[str, int, Slicer | VtkSlicer]] = [
         (name, threads, create_slicer(name, *where, threads=threads))
@@ -48,15 +48,15 @@ def case_rows(case: Case, seconds: float) -> list[dict[str, Any]]:
         slicers.append(("vtk", 1, VtkSlicer(*where)))
     rows: list[dict[str, Any]] = []
     for method, threads, slicer in slicers:
-        image, rest = slicer.image(*first), slicer.rest_coordinates(*first)
-        errors = compare(volume, first, exact, image, rest, tissue_only=method == "vtk")
+        image, rest = slicer.cut_image(*first), slicer.compute_rest_coordinates(*first)
+        errors = compare_images(volume, first, exact, image, rest, tissue_only=method == "vtk")
         rows.append({"method": method, "tets": len(mesh.tetrahedra), "threads": threads, **errors})
-    times = timed_together([slicer for *_, slicer in slicers], frames, seconds)
+    times = time_slicers([slicer for *_, slicer in slicers], frames, seconds)
     return [{**row, **columns} for row, columns in zip(rows, times, strict=True)]
 
 
-def timed_together(
-    slicers: Sequence[Slicer | VtkSlicer], frames: Sequence[Frame], seconds: float
+def time_slicers(
+    slicers: Sequence[Slicer | VtkSlicer], frames: Sequence[SliceFrame], seconds: float
 ) -> list[dict[str, float]]:
     """Times of all slicers, by column, in turns on a noisy machine.
 
@@ -79,7 +79,7 @@ def timed_together(
             for image in range(5):
                 frame = frames[(turn + image) % len(frames)]
                 before, worked = time.perf_counter(), time.process_time()
-                slicer.image(*frame)
+                slicer.cut_image(*frame)
                 wall.append(1e3 * (time.perf_counter() - before))
                 own.append(1e3 * (time.process_time() - worked))
                 if min(wall) > 8.0:
@@ -95,9 +95,9 @@ def timed_together(
     ]
 
 
-def compare(
+def compare_images(
     volume: Volume,
-    frame: Frame,
+    frame: SliceFrame,
     exact: tuple[NDArray[np.uint8], Array],
     image: NDArray[np.uint8],
     rest: Array,
@@ -116,8 +116,8 @@ def compare(
     """
     grey, places = exact
     known, seen = np.isfinite(places[..., 0]), np.isfinite(rest[..., 0])
-    off = _voxels(volume, rest - places)
-    moved = _voxels(volume, places - frame.plane.pixels()) > 0.01
+    off = _measure_voxels(volume, rest - places)
+    moved = _measure_voxels(volume, places - frame.plane.compute_pixel_positions()) > 0.01
     missed = known & ~seen & (moved if tissue_only else True)
     wrong = missed | (seen & ~known) | (off > WRONG)
     compared = known & seen & ~wrong if tissue_only else np.ones_like(wrong)
@@ -130,7 +130,7 @@ def compare(
     }
 
 
-def _voxels(volume: Volume, way: Array) -> Array:
+def _measure_voxels(volume: Volume, way: Array) -> Array:
     """(rows, columns) voxels along ways (rows, columns, 3) m."""
     return np.asarray(np.linalg.norm(way @ volume.patient_to_index[:3, :3].T, axis=-1))
 
@@ -199,7 +199,7 @@ class VtkSlicer:
         self._sampler.SetInputData(self._places)
         self._sampler.SetSourceData(self._voxels)
 
-    def image(self, nodes: Array, plane: SlicePlane) -> NDArray[np.uint8]:
+    def cut_image(self, nodes: Array, plane: SlicePlane) -> NDArray[np.uint8]:
         """(rows, columns): the grey values of tissue, 0 elsewhere."""
         self._find(nodes, plane)
         self._at.SetData(self._finder.GetOutput().GetPointData().GetArray("rest"))
@@ -209,7 +209,7 @@ class VtkSlicer:
         image = self._to_numpy(grey).reshape(plane.rows, plane.columns)
         return np.where(self._valid(plane), image, np.uint8(0))
 
-    def rest_coordinates(self, nodes: Array, plane: SlicePlane) -> Array:
+    def compute_rest_coordinates(self, nodes: Array, plane: SlicePlane) -> Array:
         """(rows, columns, 3) m, where each pixel's tissue lies at rest; NaN elsewhere."""
         self._find(nodes, plane)
         index = self._to_numpy(self._finder.GetOutput().GetPointData().GetArray("rest"))

@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 
 from us_sim.evaluation.figures import draw_error_over_time, draw_lines
-from us_sim.evaluation.report import exponent
-from us_sim.evaluation.slice.cases import MAIN, PLANES, cases
-from us_sim.evaluation.slice.measure import OURS, case_rows
+from us_sim.evaluation.report import fit_exponent
+from us_sim.evaluation.slice.cases import MAIN, PLANES, list_cases
+from us_sim.evaluation.slice.measure import OURS, measure_case
 from us_sim.evaluation.subject import Piece, Report, Subject, Target
 
 
-def _pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
+def _plan_pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
     main, other = (5.0, 1.0) if quick else (12.0, 2.0)  # s of timing
     return {
         "slice": [
@@ -27,9 +27,9 @@ def _pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
                     "deformation": case.deformation,
                     "plane": case.plane,
                 },
-                partial(case_rows, case, main if case == MAIN else other),
+                partial(measure_case, case, main if case == MAIN else other),
             )
-            for case in cases(quick)
+            for case in list_cases(quick)
         ]
     }
 
@@ -51,7 +51,7 @@ def _report(table: pd.DataFrame) -> Report:
     )
     growth = float(by_nodes.sort_index().iloc[-1] / by_nodes.sort_index().iloc[0])
     # A measured exponent of 1.004 is linear, too.
-    power = round(exponent(by_pixels.to_dict()) / 2.0, 2)
+    power = round(fit_exponent(by_pixels.to_dict()) / 2.0, 2)
     what = f"{MAIN.size} × {MAIN.size} on {main['tets'].max():,} tetrahedra pressed 12 mm"
     wrong, pixels = int(single["coverage_mismatch_px"].sum()), int((single["size"] ** 2).sum())
     targets = [
@@ -114,7 +114,7 @@ def _report(table: pd.DataFrame) -> Report:
 SLICE = Subject(
     "slice",
     "Slices: error against run time",
-    _pieces,
+    _plan_pieces,
     _report,
     libraries=("vtk",),
 )

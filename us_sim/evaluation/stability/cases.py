@@ -1,12 +1,12 @@
 """Stiff and extreme cases for tissue solvers: small meshes, materials, supports and motions.
 
->>> from us_sim.evaluation.stability.cases import held_cases, mesh_named, poses_of, sampled_cases
->>> cases = sampled_cases(64)
->>> len(cases), cases == sampled_cases(64), len(mesh_named("box").nodes)
+>>> from us_sim.evaluation.stability.cases import sample_held_cases, make_mesh, make_poses, sample_cases
+>>> cases = sample_cases(64)
+>>> len(cases), cases == sample_cases(64), len(make_mesh("box").nodes)
 (64, True, 64)
->>> [case.case for case in held_cases(3, seed=1)]
+>>> [case.case for case in sample_held_cases(3, seed=1)]
 ['held 1.0', 'held 1.1', 'held 1.2']
->>> [round(float(pose.position[2]), 3) for pose in poses_of("press", mesh_named("box"), 0.5)]
+>>> [round(float(pose.position[2]), 3) for pose in make_poses("press", make_mesh("box"), 0.5)]
 [0.008, 0.016, 0.024, 0.032, 0.04, 0.04, 0.04]
 """
 
@@ -47,7 +47,7 @@ COLLIDERS: dict[str, Collider] = {
 LAYOUTS = ("inclusion", "skin", "half", "scattered")  # where a mesh is stiffer by the contrast
 
 MOTIONS = ("press", "jump", "through", "tremor", "slide", "tilt", "scribble", "flicker")
-"""Motions of the probe, see `poses_of`."""
+"""Motions of the probe, see `make_poses`."""
 
 
 @dataclass(frozen=True)
@@ -72,18 +72,18 @@ class StabilityCase:
     held: int = 0  # frames that the probe stays where its motion ended, before its release
 
 
-def sampled_cases(count: int) -> list[StabilityCase]:
+def sample_cases(count: int) -> list[StabilityCase]:
     """``count`` (a power of two) cases spread evenly over all ranges: a Sobol sequence's first.
 
     Those of young_modulus, contrast, density, time_step and damping (but for an eighth without any)
     are even in the logarithm, those of poisson_ratio in lg(0.5 - poisson_ratio).
     """
     points = qmc.Sobol(13, scramble=False).random_base2(round(math.log2(count)))
-    return [_sampled(number, point) for number, point in enumerate(points)]
+    return [_sample_case(number, point) for number, point in enumerate(points)]
 
 
-def _sampled(number: int, point: NDArray[np.float64]) -> StabilityCase:
-    def one_of(values: tuple[str, ...], fraction: float) -> str:
+def _sample_case(number: int, point: NDArray[np.float64]) -> StabilityCase:
+    def choose_name(values: tuple[str, ...], fraction: float) -> str:
         return values[int(fraction * len(values))]
 
     contrast = 9.0 * point[1]  # decimal logarithm, as the stiffest modulus, 12
@@ -97,17 +97,17 @@ def _sampled(number: int, point: NDArray[np.float64]) -> StabilityCase:
         time_step=float(10 ** (7 * point[4] - 6)),
         damping=float(10 ** (6 * damping - 3)) if damping >= 0 else 0.0,
         depth=float(point[6]),
-        motion=one_of(MOTIONS, point[7]),
-        mesh=one_of(tuple(MESHES), point[8]),
-        collider=one_of(tuple(COLLIDERS), point[9]),
-        layout=one_of(LAYOUTS, point[10]),
-        support=one_of(("bottom", "bottom", "bottom", "walls", "three"), point[11]),
-        release=one_of(("removed", "lifted"), point[12] * 2 % 1),
-        stabilisation=one_of(("mass_scaling",) * 3 + ("substeps",), point[12]),
+        motion=choose_name(MOTIONS, point[7]),
+        mesh=choose_name(tuple(MESHES), point[8]),
+        collider=choose_name(tuple(COLLIDERS), point[9]),
+        layout=choose_name(LAYOUTS, point[10]),
+        support=choose_name(("bottom", "bottom", "bottom", "walls", "three"), point[11]),
+        release=choose_name(("removed", "lifted"), point[12] * 2 % 1),
+        stabilisation=choose_name(("mass_scaling",) * 3 + ("substeps",), point[12]),
     )
 
 
-def extreme_cases() -> list[StabilityCase]:
+def list_extreme_cases() -> list[StabilityCase]:
     """Cases with a name: one extreme at a time."""
     cases = [
         StabilityCase("soft as 1 Pa", young_modulus=1.0),
@@ -145,23 +145,23 @@ def extreme_cases() -> list[StabilityCase]:
     return cases
 
 
-def model_of(case: StabilityCase) -> TissueModel:
+def make_model(case: StabilityCase) -> TissueModel:
     """The tissue of a case, through the same checks as any other."""
-    mesh = mesh_named(case.mesh)
+    mesh = make_mesh(case.mesh)
     count = len(mesh.tetrahedra)
     modulus = np.full(count, case.young_modulus)
-    modulus[_stiff(mesh, case.layout)] *= case.contrast
+    modulus[_find_stiff(mesh, case.layout)] *= case.contrast
     materials = TissueMaterials(
         modulus, np.full(count, case.poisson_ratio), np.full(count, case.density)
     )
-    fixed = fixed_nodes(mesh, case.support)
+    fixed = find_fixed_nodes(mesh, case.support)
     everywhere = case.motion in ("through", "scribble")
     reached = np.unique(mesh.boundary) if everywhere else face_nodes(mesh, "top")
-    collider = _scaled(COLLIDERS[case.collider], float(np.ptp(mesh.nodes[:, 0])) / 0.1)
+    collider = _scale_collider(COLLIDERS[case.collider], float(np.ptp(mesh.nodes[:, 0])) / 0.1)
     return TissueModel(mesh, materials, fixed, collider, reached.astype(np.int32))
 
 
-def _scaled(collider: Collider, scale: float) -> Collider:
+def _scale_collider(collider: Collider, scale: float) -> Collider:
     """The collider so many times as large, also beyond the sizes that settings allow a probe."""
     scaled = copy.copy(collider)
     for name, size in asdict(collider).items():
@@ -169,7 +169,7 @@ def _scaled(collider: Collider, scale: float) -> Collider:
     return scaled
 
 
-def _stiff(mesh: TetrahedralMesh, layout: str) -> NDArray[np.bool_]:
+def _find_stiff(mesh: TetrahedralMesh, layout: str) -> NDArray[np.bool_]:
     """(M,) which tetrahedra are the stiff ones."""
     middle = mesh.nodes[mesh.tetrahedra].mean(axis=1)
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
@@ -184,12 +184,12 @@ def _stiff(mesh: TetrahedralMesh, layout: str) -> NDArray[np.bool_]:
 
 
 @lru_cache
-def mesh_named(name: str) -> TetrahedralMesh:
+def make_mesh(name: str) -> TetrahedralMesh:
     """One of `MESHES`, made once: its top is z = 0 and its bottom the largest z."""
     return MESHES[name]()
 
 
-def fixed_nodes(mesh: TetrahedralMesh, support: str) -> NDArray[np.bool_]:
+def find_fixed_nodes(mesh: TetrahedralMesh, support: str) -> NDArray[np.bool_]:
     """(N,) which nodes are held: the "bottom", also the "walls", or "three" of the bottom."""
     nodes = mesh.nodes
     fixed = np.zeros(len(nodes), dtype=bool)
@@ -204,12 +204,12 @@ def fixed_nodes(mesh: TetrahedralMesh, support: str) -> NDArray[np.bool_]:
     return fixed
 
 
-def _box(nx: int, ny: int, nz: int, size: float = 1.0) -> TetrahedralMesh:
+def _make_box(nx: int, ny: int, nz: int, size: float = 1.0) -> TetrahedralMesh:
     x, y = (uniform_planes(-0.05 * size, 0.05 * size, count) for count in (nx, ny))
     return box_mesh(x, y, uniform_planes(0.0, 0.08 * size, nz))
 
 
-def _jittered(mesh: TetrahedralMesh, spread: float, seed: int) -> TetrahedralMesh:
+def _jitter_mesh(mesh: TetrahedralMesh, spread: float, seed: int) -> TetrahedralMesh:
     """Every node that is not on a face moved at random; those on faces within their face."""
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     moved = mesh.nodes + spread * np.random.default_rng(seed).uniform(-1, 1, mesh.nodes.shape)
@@ -217,9 +217,9 @@ def _jittered(mesh: TetrahedralMesh, spread: float, seed: int) -> TetrahedralMes
     return TetrahedralMesh(np.where(on_face, mesh.nodes, moved), mesh.tetrahedra)
 
 
-def _delaunay() -> TetrahedralMesh:
+def _make_delaunay() -> TetrahedralMesh:
     """Of scattered points, with the slivers that come of that."""
-    points = _jittered(_box(5, 5, 5), 0.0003, seed=5).nodes
+    points = _jitter_mesh(_make_box(5, 5, 5), 0.0003, seed=5).nodes
     corners = Delaunay(points).simplices
     a, b, c, d = np.moveaxis(points[corners], 1, 0)
     volume = signed_volumes(points, corners)
@@ -233,15 +233,15 @@ def _delaunay() -> TetrahedralMesh:
 _across = partial(uniform_planes, -0.05, 0.05)
 
 MESHES: dict[str, Callable[[], TetrahedralMesh]] = {
-    "box": lambda: _box(4, 4, 4),
-    "fine": lambda: _box(6, 5, 5),
+    "box": lambda: _make_box(4, 4, 4),
+    "fine": lambda: _make_box(6, 5, 5),
     # Cells a thousand times as wide as thick.
     "layered": lambda: box_mesh(_across(4), _across(4), [0.0, 3e-5, 0.02, 0.02003, 0.08]),
-    "perturbed": lambda: _jittered(_box(5, 4, 5), 0.004, seed=3),
-    "delaunay": _delaunay,
+    "perturbed": lambda: _jitter_mesh(_make_box(5, 4, 5), 0.004, seed=3),
+    "delaunay": _make_delaunay,
     "slab": lambda: box_mesh(_across(6), _across(6), uniform_planes(0.0, 0.002, 3)),  # a skin
-    "millimetre": lambda: _box(4, 4, 4, 0.01),
-    "ten metres": lambda: _box(4, 4, 4, 100.0),
+    "millimetre": lambda: _make_box(4, 4, 4, 0.01),
+    "ten metres": lambda: _make_box(4, 4, 4, 100.0),
 }
 """The tissues by name."""
 
@@ -250,7 +250,7 @@ HOLD = 30  # frames in which the probe stays where its motion ended
 SMALL = 1e-3  # residual that must be reached by then
 
 
-def held_cases(count: int, seed: int) -> list[StabilityCase]:
+def sample_held_cases(count: int, seed: int) -> list[StabilityCase]:
     """So many random cases within anatomy, in which a held probe must come to balance.
 
     Moduli are 1 to 100 kPa (the softest), contrasts up to 1000, Poisson's ratios 0.3 to 0.495,
@@ -259,25 +259,25 @@ def held_cases(count: int, seed: int) -> list[StabilityCase]:
     """
     random = np.random.default_rng(seed)
 
-    def between(low: float, high: float) -> float:
+    def sample_between(low: float, high: float) -> float:
         return float(random.uniform(low, high))
 
-    def one_of(*names: str) -> str:
+    def choose_name(*names: str) -> str:
         return names[int(random.integers(len(names)))]
 
     return [
         StabilityCase(
             case=f"held {seed}.{number}",
-            young_modulus=10 ** between(3.0, 5.0),
-            contrast=10 ** between(0.0, 3.0),
-            layout=one_of(*LAYOUTS),
-            poisson_ratio=0.5 - 10 ** between(float(np.log10(0.005)), float(np.log10(0.2))),
-            depth=between(0.05, 0.5),
-            motion=one_of("press", "jump", "slide", "tilt", "tremor"),
-            mesh=one_of("box", "fine", "layered", "perturbed", "delaunay", "slab"),
-            support=one_of("bottom", "walls"),
-            collider=one_of("sphere", "capsule", "plate", "pebble"),
-            release=one_of("removed", "lifted"),
+            young_modulus=10 ** sample_between(3.0, 5.0),
+            contrast=10 ** sample_between(0.0, 3.0),
+            layout=choose_name(*LAYOUTS),
+            poisson_ratio=0.5 - 10 ** sample_between(float(np.log10(0.005)), float(np.log10(0.2))),
+            depth=sample_between(0.05, 0.5),
+            motion=choose_name("press", "jump", "slide", "tilt", "tremor"),
+            mesh=choose_name("box", "fine", "layered", "perturbed", "delaunay", "slab"),
+            support=choose_name("bottom", "walls"),
+            collider=choose_name("sphere", "capsule", "plate", "pebble"),
+            release=choose_name("removed", "lifted"),
             held=HOLD,
         )
         for number in range(count)
@@ -287,7 +287,7 @@ def held_cases(count: int, seed: int) -> list[StabilityCase]:
 LIFTED = Pose(position=np.array([0.0, 0.0, -100.0]))  # far from any tissue
 
 
-def poses_of(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | None]:
+def make_poses(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | None]:
     """The probe's pose in every frame until it is released.
 
     Args:
@@ -303,7 +303,7 @@ def poses_of(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | No
     nearest = top[np.argmin(np.linalg.norm(top - (low + high)[:2] / 2, axis=1))]
     about = np.array([0.4, 1.0, 0.1]) / np.linalg.norm([0.4, 1.0, 0.1])
 
-    def at(z: float, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> Pose:
+    def place_probe(z: float, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> Pose:
         """Put it z m deep, x and y widths aside, turned by an angle."""
         turn = np.append(np.sin(angle / 2) * about, np.cos(angle / 2))
         return Pose(np.array([nearest[0] + x * wide, nearest[1] + y * wide, z]), turn)
@@ -315,13 +315,26 @@ def poses_of(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | No
     places = random.uniform(-0.5, 0.5, (8, 3)) * [wide, breadth, 2 * deep]
     places += [*nearest, deep]
     paths: dict[str, list[Pose | None]] = {
-        "press": [at(part * deep) for part in (0.2, 0.4, 0.6, 0.8, 1, 1, 1)],
-        "jump": [at(deep), at(deep), at(deep, x=0.2), at(0.3 * deep)],
-        "through": [at(z) for z in stops],
-        "tremor": [at(deep + shake) for shake in shakes],
-        "slide": [at(deep, x, 0.3 * x) for x in (0.0, 0.0, 0.1, 0.25, 0.45, 0.7, 0.2)],
-        "tilt": [at(deep, angle=angle) for angle in (0.0, 0.2, 0.5, 0.9, 1.4, 1.4, -0.8)],
+        "press": [place_probe(part * deep) for part in (0.2, 0.4, 0.6, 0.8, 1, 1, 1)],
+        "jump": [
+            place_probe(deep),
+            place_probe(deep),
+            place_probe(deep, x=0.2),
+            place_probe(0.3 * deep),
+        ],
+        "through": [place_probe(z) for z in stops],
+        "tremor": [place_probe(deep + shake) for shake in shakes],
+        "slide": [place_probe(deep, x, 0.3 * x) for x in (0.0, 0.0, 0.1, 0.25, 0.45, 0.7, 0.2)],
+        "tilt": [place_probe(deep, angle=angle) for angle in (0.0, 0.2, 0.5, 0.9, 1.4, 1.4, -0.8)],
         "scribble": [Pose(place, random.standard_normal(4)) for place in places],
-        "flicker": [at(deep), None, at(0.5 * deep), LIFTED, at(deep, x=0.1), None, at(deep)],
+        "flicker": [
+            place_probe(deep),
+            None,
+            place_probe(0.5 * deep),
+            LIFTED,
+            place_probe(deep, x=0.1),
+            None,
+            place_probe(deep),
+        ],
     }
     return paths[motion]

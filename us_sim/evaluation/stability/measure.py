@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.independent_forces import Forces, least_unbalanced
+from us_sim.evaluation.independent_forces import Forces, bound_imbalance
 from us_sim.evaluation.stability.cases import (
     LIFTED,
     SMALL,
     StabilityCase,
-    mesh_named,
-    model_of,
-    poses_of,
+    make_mesh,
+    make_model,
+    make_poses,
 )
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.geometry.pose import Pose
@@ -75,8 +75,8 @@ def try_case(method: str, case: StabilityCase) -> Trial:
     trial = Trial()
     is_dynamic = TISSUE_METHODS[method].is_dynamic
     try:
-        model = model_of(case)
-        solver = create_solver(method, model, **_times(case) if is_dynamic else {})
+        model = make_model(case)
+        solver = create_solver(method, model, **_make_settings(case) if is_dynamic else {})
     except UsSimError as error:
         trial.refusal = str(error)
         if not (is_dynamic and case.stabilisation == "substeps"):  # it may need too many
@@ -92,8 +92,8 @@ def try_case(method: str, case: StabilityCase) -> Trial:
 def run_trial(solver: TissueSolver, forces: Forces, case: StabilityCase, trial: Trial) -> None:
     """Move the probe as the case says, release, and note the solver's results."""
     model = solver.model
-    poses = poses_of(case.motion, model.mesh, case.depth)
-    bound = _bound(model, poses)
+    poses = make_poses(case.motion, model.mesh, case.depth)
+    bound = _compute_bound(model, poses)
     moving = len(poses)
     poses = [*poses, *poses[-1:] * case.held]
     thickness = float(np.ptp(model.mesh.nodes[:, 2]))
@@ -112,7 +112,7 @@ def run_trial(solver: TissueSolver, forces: Forces, case: StabilityCase, trial: 
         trial.slowest_ms = max(trial.slowest_ms, 1e3 * (time.perf_counter() - start))
         if deformation.actions and deformation.actions not in trial.actions:
             trial.actions.append(deformation.actions)
-        if not _finite(deformation):
+        if not _is_finite(deformation):
             trial.finite = False
             return
         if case.held and moving <= number + 1 <= len(poses):
@@ -130,11 +130,11 @@ def run_trial(solver: TissueSolver, forces: Forces, case: StabilityCase, trial: 
         trial.bounded = trial.bounded and away <= bound
         free = number - len(poses)
         if free < 0 and not failed and not model.fixed[deformation.contact_nodes].all():
-            unbalanced, rounding, load = least_unbalanced(model, forces, deformation)
+            unbalanced, rounding, load = bound_imbalance(model, forces, deformation)
             heaviest = max(heaviest, load)
             if heaviest > 0.0 and trial.truthful:  # to which it refers where less is pushed
                 reported, checked = float(deformation.residual), unbalanced / heaviest
-                trial.truthful = agrees(reported, checked, rounding / heaviest)
+                trial.truthful = is_residual_true(reported, checked, rounding / heaviest)
                 trial.residual_reported, trial.residual_checked = reported, checked
         if free >= 0:
             trial.recovered_mm = 1e3 * away
@@ -149,10 +149,10 @@ def run_trial(solver: TissueSolver, forces: Forces, case: StabilityCase, trial: 
     if stuck >= frames:
         trial.failure = "went on failing after the release, in every frame"
     if trial.held and TISSUE_METHODS[solver.name].is_judged_at_rest and not trial.failure:
-        trial.failure = _unbalanced(trial, case)
+        trial.failure = _describe_imbalance(trial, case)
 
 
-def _unbalanced(trial: Trial, case: StabilityCase) -> str:
+def _describe_imbalance(trial: Trial, case: StabilityCase) -> str:
     """Fault under the held probe; empty where the tissue is in balance and not inverted."""
     if trial.frames_to_balance is None:
         return f"held for {case.held} frames it was left with a residual of {trial.held[-1]:.3g}"
@@ -161,7 +161,7 @@ def _unbalanced(trial: Trial, case: StabilityCase) -> str:
     return ""
 
 
-def agrees(reported: float, checked: float, rounding: float) -> bool:
+def is_residual_true(reported: float, checked: float, rounding: float) -> bool:
     """Whether a reported residual is true: at least half of the least that it can be.
 
     Negligible ones are true: below 1e-5, or below the ``rounding`` of nodes to doubles.
@@ -169,9 +169,9 @@ def agrees(reported: float, checked: float, rounding: float) -> bool:
     return math.isfinite(checked) and checked <= max(1e-5, rounding, 2.0 * reported)
 
 
-def _times(case: StabilityCase) -> dict[str, Any]:
+def _make_settings(case: StabilityCase) -> dict[str, Any]:
     """Settings of a method with masses; critical damping is that of one edge's springs, about."""
-    mesh = mesh_named(case.mesh)
+    mesh = make_mesh(case.mesh)
     nodes, edges = mesh.nodes, mesh.edges
     edge = float(np.linalg.norm(nodes[edges[:, 1]] - nodes[edges[:, 0]], axis=1).mean())
     modulus = case.young_modulus * math.sqrt(case.contrast)
@@ -182,12 +182,12 @@ def _times(case: StabilityCase) -> dict[str, Any]:
     }
 
 
-def _finite(deformation: Deformation) -> bool:
+def _is_finite(deformation: Deformation) -> bool:
     numbers = (deformation.nodes, deformation.force, deformation.torque, deformation.residual)
     return all(bool(np.isfinite(number).all()) for number in numbers)
 
 
-def _bound(model: TissueModel, poses: list[Pose | None]) -> float:
+def _compute_bound(model: TissueModel, poses: list[Pose | None]) -> float:
     """m, three times as far as any node can be pushed."""
     nodes, box = model.mesh.nodes, model.collider.offset_box
     pressing = (pose for pose in poses if pose is not None and pose is not LIFTED)

@@ -16,10 +16,10 @@ from threadpoolctl import threadpool_limits
 from us_sim.evaluation.figures import draw_error_over_parameter
 from us_sim.evaluation.stability.cases import (
     StabilityCase,
-    extreme_cases,
-    held_cases,
-    model_of,
-    sampled_cases,
+    list_extreme_cases,
+    make_model,
+    sample_cases,
+    sample_held_cases,
 )
 from us_sim.evaluation.stability.measure import try_case
 from us_sim.evaluation.subject import Piece, Report, Subject
@@ -29,37 +29,37 @@ from us_sim.tissue.solvers.solver import create_solver
 
 def plan_pieces(quick: bool) -> dict[str, list[Piece]]:
     """Every case for every method; the cases are the same in every run."""
-    cases = [*extreme_cases(), *sampled_cases(32 if quick else 1024)]
-    cases += held_cases(24 if quick else 500, 1)
+    cases = [*list_extreme_cases(), *sample_cases(32 if quick else 1024)]
+    cases += sample_held_cases(24 if quick else 500, 1)
     return {"stability": plan_cases(cases)}
 
 
 def plan_cases(cases: Sequence[StabilityCase]) -> list[Piece]:
     """These cases for every method."""
-    bench = Bench()
+    bench = StabilityBench()
     pieces = []
     for name, method in TISSUE_METHODS.items():
         for case in cases:
             varied: dict[str, Any] = asdict(case)
             if not method.is_dynamic:
                 varied |= dict.fromkeys(("time_step", "damping", "stabilisation"))
-            pieces.append(Piece({"method": name, **varied}, partial(bench.run, name, case)))
+            pieces.append(Piece({"method": name, **varied}, partial(bench.run_case, name, case)))
     return pieces
 
 
-class Bench:
+class StabilityBench:
     """Runs cases, with what solvers precompute in a folder of its own that is deleted."""
 
     def __init__(self) -> None:
         self._cache = tempfile.TemporaryDirectory(prefix="us-sim-stability-")
         self._warm: set[str] = set()
 
-    def run(self, method: str, case: StabilityCase) -> Iterator[dict[str, Any]]:
+    def run_case(self, method: str, case: StabilityCase) -> Iterator[dict[str, Any]]:
         """Run a case."""
         cache = {"US_SIM_CACHE": self._cache.name}
         with threadpool_limits(1), patch.dict(os.environ, cache):
             if method not in self._warm:  # so that no frame's time contains a compilation
-                create_solver(method, model_of(StabilityCase("box"))).warm_up()
+                create_solver(method, make_model(StabilityCase("box"))).warm_up()
                 self._warm.add(method)
             trial = try_case(method, case)
         ran = {} if trial.refusal else asdict(trial)
@@ -121,10 +121,10 @@ def report_stability(rows: pd.DataFrame) -> Report:
             ("recovery", "softness", "recovered_mm", "Farthest from rest after release", 1e-6),
         )
     }
-    return Report(take_home, {"counts": _count(rows), **figures})
+    return Report(take_home, {"counts": _count_faults(rows), **figures})
 
 
-def _count(rows: pd.DataFrame) -> pd.DataFrame:
+def _count_faults(rows: pd.DataFrame) -> pd.DataFrame:
     """How each method fared, in all cases."""
     counts = []
     for name, mine in rows.groupby("method", sort=False):

@@ -5,7 +5,7 @@
 >>> scene = SCENES["press_and_slide"]
 >>> len(scene.path), scene.path[-1].position.round(4).tolist()
 (18, [0.02, 0.0, 0.025])
->>> int(scene.model(MESHES[0]).fixed.sum())  # nodes at the bottom
+>>> int(scene.make_model(MESHES[0]).fixed.sum())  # nodes at the bottom
 200
 """
 
@@ -17,11 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.evaluation.block import EXTENT, block, graded_planes
+from us_sim.evaluation.block import EXTENT, make_block_mesh, make_graded_planes
 from us_sim.geometry.collider import Capsule, Collider, RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import uniform_material
+from us_sim.tissue.elasticity.materials import make_uniform_materials
 from us_sim.tissue.model import TissueModel, face_nodes
 
 MAIN_SCENE = "press_25mm"  # the scene that is pressed on every mesh
@@ -32,7 +32,7 @@ _AROUND = (-0.03, 0.03, 0.03)  # m, touched by a sphere that is pressed straight
 
 
 @dataclass(frozen=True)
-class Scene:
+class BlockScene:
     """A probe's path into the block; results are compared at its end."""
 
     name: str
@@ -47,35 +47,35 @@ class Scene:
         """Soft tissue."""
         return Material(10e3, self.poisson_ratio, 1000.0)
 
-    def model(self, counts: tuple[int, int, int]) -> TissueModel:
+    def make_model(self, counts: tuple[int, int, int]) -> TissueModel:
         """The block on a uniform mesh of so many nodes along each axis."""
-        mesh = block(counts)
+        mesh = make_block_mesh(counts)
         fixed = np.zeros(len(mesh.nodes), dtype=bool)
         fixed[face_nodes(mesh, "bottom")] = True
-        materials = uniform_material(mesh, self.material)
+        materials = make_uniform_materials(mesh, self.material)
         return TissueModel(mesh, materials, fixed, self.collider, face_nodes(mesh, "top"))
 
-    def reference_planes(self, size: float) -> tuple[NDArray[np.float64], ...]:
+    def make_reference_planes(self, size: float) -> tuple[NDArray[np.float64], ...]:
         """Planes (m) of the reference's half block, ``size`` apart where the probe touches."""
         low, high, beside = self.touched
         return (
-            graded_planes(*EXTENT[0], low, high, size, 1.2),
-            graded_planes(0.0, EXTENT[1][1], 0.0, beside, size, 1.2),
-            graded_planes(*EXTENT[2], 0.0, 0.02, size, 1.2),
+            make_graded_planes(*EXTENT[0], low, high, size, 1.2),
+            make_graded_planes(0.0, EXTENT[1][1], 0.0, beside, size, 1.2),
+            make_graded_planes(*EXTENT[2], 0.0, 0.02, size, 1.2),
         )
 
 
-def _press(depth: float) -> tuple[Pose, ...]:
+def _plan_press(depth: float) -> tuple[Pose, ...]:
     depths = np.append(np.arange(_STEP, depth - 1e-9, _STEP), depth)
     return tuple(Pose(np.array([0.0, 0.0, z])) for z in depths)
 
 
-def _slide(depth: float, distance: float) -> tuple[Pose, ...]:
+def _plan_slide(depth: float, distance: float) -> tuple[Pose, ...]:
     travelled = np.arange(1, round(distance / _STEP) + 1) * _STEP
     return tuple(Pose(np.array([x, 0.0, depth])) for x in travelled)
 
 
-def _tilt(depth: float, angle: float) -> tuple[Pose, ...]:
+def _plan_tilt(depth: float, angle: float) -> tuple[Pose, ...]:
     turn = math.radians(2.5)  # in a frame
     halves = np.arange(1, round(angle / turn) + 1) * turn / 2
     return tuple(
@@ -85,33 +85,33 @@ def _tilt(depth: float, angle: float) -> tuple[Pose, ...]:
 
 
 _ALL = (
-    Scene("press_12mm", "pressed by 12 mm", _SPHERE, _press(0.012), _AROUND),
-    Scene("press_25mm", "pressed by 25 mm", _SPHERE, _press(0.025), _AROUND),
-    Scene(
+    BlockScene("press_12mm", "pressed by 12 mm", _SPHERE, _plan_press(0.012), _AROUND),
+    BlockScene("press_25mm", "pressed by 25 mm", _SPHERE, _plan_press(0.025), _AROUND),
+    BlockScene(
         "press_and_slide",
         "pressed by 25 mm, then slid by 20 mm",
         _SPHERE,
-        _press(0.025) + _slide(0.025, 0.02),
+        _plan_press(0.025) + _plan_slide(0.025, 0.02),
         (-0.01, 0.05, 0.03),
     ),
-    Scene(
+    BlockScene(
         "tilt",
         "a capsule pressed by 12 mm, then tilted by 20°",
         Capsule(0.025, 0.04),
-        _press(0.012) + _tilt(0.012, math.radians(20)),
+        _plan_press(0.012) + _plan_tilt(0.012, math.radians(20)),
         (-0.05, 0.05, 0.03),
     ),
-    Scene(
+    BlockScene(
         "flat_10mm",
         "a flat face with rounded edges pressed by 10 mm",
         RoundedBox(0.05, 0.03, 0.06, 0.006),
-        _press(0.01),
+        _plan_press(0.01),
         (-0.04, 0.04, 0.03),
     ),
-    Scene(
+    BlockScene(
         "press_25mm_nu0.49",
         "pressed by 25 mm, Poisson's ratio 0.49",
-        *(_SPHERE, _press(0.025), _AROUND, 0.49),
+        *(_SPHERE, _plan_press(0.025), _AROUND, 0.49),
     ),
 )
 

@@ -3,7 +3,7 @@
 >>> planes = [0.0, 0.05, 0.1]
 >>> block = NeoHookeanHexahedra((planes, planes, planes), Material(10e3, 0.45, 1000.0))
 >>> turned = block.nodes @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).T - block.nodes
->>> block.nodes.shape, bool(abs(block.forces(turned)).max() < 1e-12)
+>>> block.nodes.shape, bool(abs(block.compute_forces(turned)).max() < 1e-12)
 ((125, 3), True)
 """
 
@@ -69,13 +69,13 @@ class NeoHookeanHexahedra:
         linear = Basis(mesh, ElementHex1())
         self.corners = linear.doflocs.T.copy()  # (C, 3) m
         #: (N, C), interpolation from the corners to the nodes.
-        self.from_corners = self._values_at(linear, self.nodes)
+        self.from_corners = self._evaluate_basis(linear, self.nodes)
         self._weights = basis.dx  # (M, Q) m3
         # (M, Q, 3, 27) 1/m
         self._gradients = np.ascontiguousarray(
             np.stack([field[0].grad for field in basis.basis]).transpose(2, 3, 1, 0)
         )
-        self._projection = _onto_linear(*basis.quadrature)  # (Q, Q)
+        self._projection = _make_linear_projection(*basis.quadrature)  # (Q, Q)
         modulus, ratio = material.young_modulus, material.poisson_ratio
         self._shear = modulus / (2 * (1 + ratio))
         whole = self._shear / (1 - 2 * ratio)  # lambda + mu
@@ -86,11 +86,11 @@ class NeoHookeanHexahedra:
         self.surface_points = np.asarray(surface.global_coordinates()).reshape(3, -1).T  # (S, 3) m
         self.surface_weights = surface.dx.ravel()  # (S,) m2
         #: (S, N), values of the shape functions at the surface points.
-        self.surface_values = self._values_at(basis, self.surface_points)
+        self.surface_values = self._evaluate_basis(basis, self.surface_points)
 
-    def energy(self, displacement: Array) -> float:
+    def compute_energy(self, displacement: Array) -> float:
         """J, stored at a displacement (N, 3); infinite where something is inside out."""
-        gradient = self._deformation_gradient(displacement)
+        gradient = self._compute_deformation_gradient(displacement)
         ratio = np.linalg.det(gradient)
         if not ratio.min() > 0.0:
             return np.inf
@@ -100,10 +100,10 @@ class NeoHookeanHexahedra:
         density += 0.5 * self._linear * (swelling @ self._projection.T) ** 2
         return float((self._weights * density).sum())
 
-    def forces(self, displacement: Array) -> Array:
+    def compute_forces(self, displacement: Array) -> Array:
         """(N, 3) N, derivative of the energy."""
-        gradient = self._deformation_gradient(displacement)
-        pressure, cofactor = self._pressure(gradient)
+        gradient = self._compute_deformation_gradient(displacement)
+        pressure, cofactor = self._compute_pressure(gradient)
         stress = self._shear * gradient + pressure[..., None, None] * cofactor
         stress *= self._weights[..., None, None]
         local = (stress @ self._gradients).sum(axis=1)  # (M, 3, 27)
@@ -115,11 +115,13 @@ class NeoHookeanHexahedra:
             axis=1,
         )
 
-    def stiffness(self, displacement: Array) -> bsr_array:
+    def assemble_stiffness(self, displacement: Array) -> bsr_array:
         """(3N, 3N) N/m, second derivative of the energy, in 3x3 blocks; nothing inside out."""
-        gradient = self._deformation_gradient(displacement)
+        gradient = self._compute_deformation_gradient(displacement)
         batches = [slice(k, k + _BATCH) for k in range(0, len(gradient), _BATCH)]
-        local = np.concatenate([self._local_stiffness(gradient[some], some) for some in batches])
+        local = np.concatenate(
+            [self._compute_local_stiffness(gradient[some], some) for some in batches]
+        )
         rows = np.repeat(self.elements, 27, axis=1).ravel()
         columns = np.tile(self.elements, (1, 27)).ravel()
         entries = [
@@ -129,16 +131,16 @@ class NeoHookeanHexahedra:
         blocks = np.stack([part.data for part in entries], axis=1).reshape(-1, 3, 3)
         return bsr_array((blocks, entries[0].indices, entries[0].indptr))
 
-    def volume(self, displacement: Array) -> float:
+    def compute_volume(self, displacement: Array) -> float:
         """m3, of the deformed box."""
-        ratio = np.linalg.det(self._deformation_gradient(displacement))
+        ratio = np.linalg.det(self._compute_deformation_gradient(displacement))
         return float((self._weights * ratio).sum())
 
-    def at(self, field: Array, points: Array) -> Array:
+    def interpolate_field(self, field: Array, points: Array) -> Array:
         """(P, D), a nodal field (N, D) interpolated at rest positions (P, 3) m in the box."""
-        return np.asarray(self._values_at(self._basis, points) @ field)
+        return np.asarray(self._evaluate_basis(self._basis, points) @ field)
 
-    def _values_at(self, basis: Basis, points: Array) -> csr_array:
+    def _evaluate_basis(self, basis: Basis, points: Array) -> csr_array:
         """(P, N), values of a basis' shape functions at points (P, 3) m in the box."""
         cells = tuple(
             np.clip(np.searchsorted(p, x, side="right") - 1, 0, len(p) - 2)
@@ -153,33 +155,33 @@ class NeoHookeanHexahedra:
         found.eliminate_zeros()
         return found
 
-    def _deformation_gradient(self, displacement: Array) -> Array:
+    def _compute_deformation_gradient(self, displacement: Array) -> Array:
         """(M, Q, 3, 3)."""
         local = displacement[self.elements][:, None]  # (M, 1, 27, 3)
         return (self._gradients @ local).swapaxes(2, 3) + np.eye(3)
 
-    def _local_stiffness(self, gradient: Array, batch: slice) -> Array:
+    def _compute_local_stiffness(self, gradient: Array, batch: slice) -> Array:
         """(B, 729, 9) N/m of each pair of nodes, of a batch of elements.
 
         The cofactor's derivative is (cof_ij cof_kl - cof_il cof_kj) / J.
         """
         count, points = gradient.shape[:2]
         weights, shapes = self._weights[batch], self._gradients[batch]
-        pressure, cofactor = self._pressure(gradient)
+        pressure, cofactor = self._compute_pressure(gradient)
         turned = (cofactor @ shapes).swapaxes(2, 3).reshape(count, points, 81)  # d J
         pushed = weights * pressure / np.linalg.det(gradient)
-        twisted = _products(turned, pushed)
-        local = twisted + _products(turned, self._own * weights)
-        local += _products(self._projection @ turned, self._linear * weights)
+        twisted = _sum_products(turned, pushed)
+        local = twisted + _sum_products(turned, self._own * weights)
+        local += _sum_products(self._projection @ turned, self._linear * weights)
         local = local.reshape(count, 27, 3, 27, 3)
         local -= twisted.reshape(local.shape).swapaxes(2, 4)
-        sheared = _products(
+        sheared = _sum_products(
             shapes.reshape(count, points * 3, 27), np.repeat(self._shear * weights, 3, axis=1)
         )
         local += sheared[:, :, None, :, None] * np.eye(3)[:, None]
         return local.swapaxes(2, 3).reshape(count, 729, 9)
 
-    def _pressure(self, gradient: Array) -> tuple[Array, Array]:
+    def _compute_pressure(self, gradient: Array) -> tuple[Array, Array]:
         """(M, Q) Pa, the factor of the cofactor in the stress, and the cofactor (M, Q, 3, 3)."""
         rows = [np.cross(gradient[..., i - 2, :], gradient[..., i - 1, :]) for i in range(3)]
         swelling = np.linalg.det(gradient) - 1.0
@@ -187,12 +189,12 @@ class NeoHookeanHexahedra:
         return self._own * swelling - self._shear + linear, np.stack(rows, axis=-2)
 
 
-def _products(vectors: Array, weights: Array) -> Array:
+def _sum_products(vectors: Array, weights: Array) -> Array:
     """(B, K, K), of vectors (B, Q, K) of each batch the weighted sum of products of all pairs."""
     return (vectors * weights[..., None]).swapaxes(1, 2) @ vectors
 
 
-def _onto_linear(points: Array, weights: Array) -> Array:
+def _make_linear_projection(points: Array, weights: Array) -> Array:
     """(Q, Q), from values at quadrature points (3, Q) of a box to the nearest linear function's."""
     linear = np.vstack([np.ones(points.shape[1]), points]).T  # (Q, 4)
     weighted = linear * weights[:, None]

@@ -4,10 +4,10 @@ Its nodes are compared with large deformation on fine quadratic elements
 (`us_sim.evaluation.tissue.reference`).
 
 >>> import numpy as np
->>> from us_sim.evaluation.tissue.measure import Outcome, compare
+>>> from us_sim.evaluation.tissue.measure import PathOutcome, compare_outcomes
 >>> nodes = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
->>> exact = Outcome(nodes * 0.1, 10.0, 1.0)
->>> errors = compare(Outcome(nodes * 0.11, 9.0, 1.01), exact, rest_volume=2.0)
+>>> exact = PathOutcome(nodes * 0.1, 10.0, 1.0)
+>>> errors = compare_outcomes(PathOutcome(nodes * 0.11, 9.0, 1.01), exact, rest_volume=2.0)
 >>> {name: round(error, 4) for name, error in errors.items()}
 {'rel_l2_error': 0.1, 'max_error_mm': 10.0, 'force_error': 0.1, 'volume_error': 0.005}
 """
@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from us_sim.errors import SolverError
-from us_sim.evaluation.block import LARGEST_MESH, MESHES, block
+from us_sim.evaluation.block import LARGEST_MESH, MESHES, make_block_mesh
 from us_sim.evaluation.subject import Piece
-from us_sim.evaluation.tissue.cases import MAIN_SCENE, SCENES, Scene
-from us_sim.evaluation.tissue.reference import Solution, solve_reference
+from us_sim.evaluation.tissue.cases import MAIN_SCENE, SCENES, BlockScene
+from us_sim.evaluation.tissue.reference import ContactSolution, solve_reference
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS, Setting
 from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
 from us_sim.tissue.model import Deformation, TissueModel
@@ -39,7 +39,7 @@ _SIZES, _QUICK_SIZES = (0.01, 0.0065, 0.005), (0.01, 0.0065)  # m, of the refere
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class PathOutcome:
     """The end of a path by a method, or by a reference at the same nodes."""
 
     displacement: NDArray[np.float64]  # (N, 3) m
@@ -47,7 +47,7 @@ class Outcome:
     volume: float  # m3, of the deformed block
 
     @classmethod
-    def of(cls, model: TissueModel, deformation: Deformation) -> Outcome:
+    def from_deformation(cls, model: TissueModel, deformation: Deformation) -> PathOutcome:
         """The outcome of a solver."""
         return cls(
             deformation.nodes - model.mesh.nodes,
@@ -56,7 +56,9 @@ class Outcome:
         )
 
 
-def compare(found: Outcome, exact: Outcome, rest_volume: float) -> dict[str, float]:
+def compare_outcomes(
+    found: PathOutcome, exact: PathOutcome, rest_volume: float
+) -> dict[str, float]:
     """Errors of ``found``, by column; all but ``max_error_mm`` are relative."""
     difference = found.displacement - exact.displacement
     return {
@@ -73,10 +75,10 @@ def plan_pieces(quick: bool) -> dict[str, list[Piece]]:
     The main press takes every mesh, the others the paper's finest. All settings are tried on that,
     and in the main press on the coarsest; elsewhere each method's defaults.
     """
-    bench = Bench()
+    bench = TissueBench()
     references, trials = [], []
     for scene in (SCENES[name] for name in _QUICK_SCENES) if quick else SCENES.values():
-        solve = partial(bench.solve_reference, scene, _QUICK_SIZES if quick else _SIZES)
+        solve = partial(bench.measure_reference, scene, _QUICK_SIZES if quick else _SIZES)
         references.append(Piece({"scene": scene.name}, solve))
         main = scene.name == MAIN_SCENE
         meshes = [*MESHES, LARGEST_MESH] if main and not quick else [MESHES[-1]]
@@ -86,15 +88,15 @@ def plan_pieces(quick: bool) -> dict[str, list[Piece]]:
             some = 1 if counts not in (MESHES[0], MESHES[-1]) or (quick and not main) else None
             for method in TISSUE_METHODS.values():
                 for setting in method.settings[: 3 if quick and main else some]:
-                    run = partial(bench.run, scene, counts, method.name, setting)
-                    trials.append(Piece(_case(scene, counts, method.name, setting), run))
+                    run = partial(bench.run_method, scene, counts, method.name, setting)
+                    trials.append(Piece(_describe_trial(scene, counts, method.name, setting), run))
     return {"references": references, "tissue": trials}
 
 
-def _case(
-    scene: Scene, counts: tuple[int, int, int], method: str, setting: Setting
+def _describe_trial(
+    scene: BlockScene, counts: tuple[int, int, int], method: str, setting: Setting
 ) -> dict[str, Any]:
-    mesh = block(counts)
+    mesh = make_block_mesh(counts)
     return {
         "scene": scene.name,
         "method": method,
@@ -105,21 +107,23 @@ def _case(
     }
 
 
-class Bench:
+class TissueBench:
     """Keeps the model, and what its trials are compared with."""
 
     def __init__(self) -> None:
-        self._references: dict[str, Solution] = {}
+        self._references: dict[str, ContactSolution] = {}
         self._models: dict[Any, TissueModel] = {}
-        self._exact: dict[Any, Outcome] = {}  # of the last model
+        self._exact: dict[Any, PathOutcome] = {}  # of the last model
         self._warm: set[str] = set()
 
-    def solve_reference(self, scene: Scene, sizes: tuple[float, ...]) -> Iterator[dict[str, Any]]:
+    def measure_reference(
+        self, scene: BlockScene, sizes: tuple[float, ...]
+    ) -> Iterator[dict[str, Any]]:
         """Find the nonlinear reference of a scene, and how far it has converged."""
         *_, coarse, fine = solve_reference(scene, sizes)
         self._references[scene.name] = fine
         points = fine.block.corners
-        here, there = fine.at(points), coarse.at(points)
+        here, there = fine.interpolate_displacement(points), coarse.interpolate_displacement(points)
         yield {
             "elements": f"{sizes[-2] * 1e3:g} → {sizes[-1] * 1e3:g} mm",
             "unknowns": fine.displacement.size,
@@ -131,37 +135,43 @@ class Bench:
             "penetration_mm": fine.penetration * 1e3,
         }
 
-    def run(
-        self, scene: Scene, counts: tuple[int, int, int], method: str, setting: Setting
+    def run_method(
+        self, scene: BlockScene, counts: tuple[int, int, int], method: str, setting: Setting
     ) -> Iterator[dict[str, Any]]:
         """Time a method, and compare it with the reference."""
         if (scene.name, counts) not in self._models:
-            self._models = {(scene.name, counts): scene.model(counts)}
-            self._exact = {(scene.name, counts): self._outcome(scene, block(counts).nodes)}
+            self._models = {(scene.name, counts): scene.make_model(counts)}
+            self._exact = {
+                (scene.name, counts): self._find_exact(scene, make_block_mesh(counts).nodes)
+            }
         model, exact = self._models[scene.name, counts], self._exact[scene.name, counts]
         solver = create_solver(method, model, **setting)
         if method not in self._warm:
             solver.warm_up()
             self._warm.add(method)
-        milliseconds, last = _follow(solver, scene)
+        milliseconds, last = _time_path(solver, scene)
         volumes = signed_volumes(last.nodes, model.mesh.tetrahedra)
         yield {
             "ms_median": float(np.median(milliseconds)),
             "ms_p99": float(np.percentile(milliseconds, 99)),
-            **compare(Outcome.of(model, last), exact, float(model.mesh.volumes.sum())),
-            "estimated_error": solver.discretisation_error(),
+            **compare_outcomes(
+                PathOutcome.from_deformation(model, last), exact, float(model.mesh.volumes.sum())
+            ),
+            "estimated_error": solver.estimate_discretisation_error(),
             "smallest_volume_ratio": float((volumes / model.mesh.volumes).min()),
         }
 
-    def _outcome(self, scene: Scene, nodes: NDArray[np.float64]) -> Outcome:
+    def _find_exact(self, scene: BlockScene, nodes: NDArray[np.float64]) -> PathOutcome:
         """The reference at nodes (N, 3) m."""
         if scene.name not in self._references:
             raise SolverError(f"the reference of {scene.name} was not found")
         there = self._references[scene.name]
-        return Outcome(there.at(nodes), float(there.force[2]), there.volume)
+        return PathOutcome(
+            there.interpolate_displacement(nodes), float(there.force[2]), there.volume
+        )
 
 
-def _follow(solver: TissueSolver, scene: Scene) -> tuple[list[float], Deformation]:
+def _time_path(solver: TissueSolver, scene: BlockScene) -> tuple[list[float], Deformation]:
     """ms of every frame of the path, followed three times from rest or for 20 s, and the last.
 
     The first pass warms caches and does not count, if there is another.

@@ -27,7 +27,7 @@ from scipy.sparse.linalg import LinearOperator, cg, splu
 from scipy.spatial import KDTree
 
 from us_sim.errors import SolverError
-from us_sim.evaluation.tissue.cases import Scene
+from us_sim.evaluation.tissue.cases import BlockScene
 from us_sim.evaluation.tissue.finite_elements import NeoHookeanHexahedra
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
@@ -51,7 +51,7 @@ _STIFFENED = (0.0, 1e-3, 1e-2, 0.1, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class ContactSolution:
     """The equilibrium under the last pose."""
 
     block: NeoHookeanHexahedra  # the half with y >= 0
@@ -61,10 +61,10 @@ class Solution:
     volume: float  # m3, of the whole deformed block
     penetration: float  # m, the deepest point of the surface inside the probe
 
-    def at(self, points: Array) -> Array:
+    def interpolate_displacement(self, points: Array) -> Array:
         """(P, 3) m, displacement of rest positions (P, 3) m anywhere in the block."""
         side = np.where(points[:, 1:2] < 0, -1.0, 1.0) * [[0, 1, 0]] + [[1, 0, 1]]
-        return self.block.at(self.displacement, points * side) * side
+        return self.block.interpolate_field(self.displacement, points * side) * side
 
 
 def solve_contact(
@@ -72,8 +72,8 @@ def solve_contact(
     material: Material,
     collider: Collider,
     poses: Sequence[Pose],
-    start: Solution | None = None,
-) -> Solution:
+    start: ContactSolution | None = None,
+) -> ContactSolution:
     """Approach the last pose through the others.
 
     Args:
@@ -98,7 +98,7 @@ def solve_contact(
     penalties = np.array(_HARDER) * modulus
     search.penalty = _SOFT * modulus
     if start is not None:
-        search.displacement = start.at(block.nodes) * search.free
+        search.displacement = start.interpolate_displacement(block.nodes) * search.free
         nearest = KDTree(start.block.surface_points).query(block.surface_points)[1]
         search.push, penalties = start.pressure[nearest], penalties[3:]
     for pose in poses[:-1]:
@@ -106,18 +106,18 @@ def solve_contact(
     for penalty in penalties:
         search.penalty = penalty
         search.equilibrate(poses[-1], _APPROACHING)
-        search.push = search.pressure(poses[-1])[0]
+        search.push = search.compute_pressure(poses[-1])[0]
     for _ in range(_AUGMENTATIONS):
         search.equilibrate(poses[-1], _TOLERANCE)
-        penetration = search.penetration(poses[-1])
+        penetration = search.compute_penetration(poses[-1])
         if penetration <= _PENETRATION:
             break
-        search.push = search.pressure(poses[-1])[0]
-    pressure, normal, _ = search.pressure(poses[-1])
+        search.push = search.compute_pressure(poses[-1])[0]
+    pressure, normal, _ = search.compute_pressure(poses[-1])
     total = 2.0 * ((block.surface_weights * pressure)[:, None] * normal).sum(axis=0)
     force = -(total * [1, 0, 1]) @ poses[-1].rotation
-    volume = 2.0 * block.volume(search.displacement)
-    return Solution(block, search.displacement, pressure, force, volume, penetration)
+    volume = 2.0 * block.compute_volume(search.displacement)
+    return ContactSolution(block, search.displacement, pressure, force, volume, penetration)
 
 
 class _Search:
@@ -128,37 +128,37 @@ class _Search:
         self.penalty = 0.0
         self.displacement = np.zeros_like(block.nodes)
         self.push = np.zeros(len(block.surface_points))  # Pa, multipliers
-        self.free = _movable(block, block.nodes)
+        self.free = _find_movable(block, block.nodes)
         self._surface = csr_array(kron(block.surface_values, np.eye(3)))  # (3S, 3N)
-        self._mask = _diagonal(self.free.ravel().astype(float))
-        coarse = np.flatnonzero(_movable(block, block.corners).ravel())
+        self._mask = _make_diagonal(self.free.ravel().astype(float))
+        coarse = np.flatnonzero(_find_movable(block, block.corners).ravel())
         spread = csr_array(kron(block.from_corners, np.eye(3)))
         self._prolongation = (self._mask @ spread).tocsr()[:, coarse]
 
-    def pressure(self, pose: Pose) -> tuple[Array, Array, Array]:
+    def compute_pressure(self, pose: Pose) -> tuple[Array, Array, Array]:
         """At the surface points: Pa (S,), the direction of the push (S, 3), curvature (S, 3, 3)."""
-        gap, normal, curvature = self._distance(pose)
+        gap, normal, curvature = self._measure_gaps(pose)
         return np.maximum(self.push - self.penalty * gap, 0.0), normal, curvature
 
-    def penetration(self, pose: Pose) -> float:
+    def compute_penetration(self, pose: Pose) -> float:
         """m, how deep the deepest surface point is inside the probe."""
-        return max(0.0, -float(self._distance(pose)[0].min()))
+        return max(0.0, -float(self._measure_gaps(pose)[0].min()))
 
     def equilibrate(self, pose: Pose, tolerance: float) -> None:
         """Move to where the unbalanced force is below ``tolerance`` times the contact force."""
-        energy = self._energy(pose)
+        energy = self._compute_energy(pose)
         for _ in range(_NEWTON_STEPS):
-            unbalanced, load = self._unbalanced(pose)
+            unbalanced, load = self._compute_imbalance(pose)
             residual = float(np.linalg.norm(unbalanced))
             if residual <= tolerance * load or residual < 1e-12:
                 return
-            step = self._step(pose, unbalanced)
+            step = self._compute_step(pose, unbalanced)
             slope = float((unbalanced * step).sum())
             before, whole = self.displacement, energy
             length = 1.0
             while length > _SHORTEST_STEP:
                 self.displacement = before + length * step
-                energy = self._energy(pose)
+                energy = self._compute_energy(pose)
                 # The rounding of the energy hides the last steps' gain.
                 if energy <= whole + 1e-4 * length * slope + 1e-13 * abs(whole):
                     break
@@ -170,40 +170,40 @@ class _Search:
             f"the pose in smaller steps or on a finer mesh"
         )
 
-    def _step(self, pose: Pose, unbalanced: Array) -> Array:
+    def _compute_step(self, pose: Pose, unbalanced: Array) -> Array:
         """(N, 3) m, of Newton's method; with a stiffer tangent where that is not definite."""
-        tangent, right = self._tangent(pose), -unbalanced.ravel()
+        tangent, right = self._assemble_tangent(pose), -unbalanced.ravel()
         for part in _STIFFENED:
-            stiffer = bsr_array(_diagonal(part * tangent.diagonal()), blocksize=(3, 3))
-            step = _solved(tangent + stiffer if part else tangent, right, self._prolongation)
+            stiffer = bsr_array(_make_diagonal(part * tangent.diagonal()), blocksize=(3, 3))
+            step = _solve_system(tangent + stiffer if part else tangent, right, self._prolongation)
             if step @ right > 0.0:
                 break
         return step.reshape(-1, 3)
 
-    def _energy(self, pose: Pose) -> float:
-        pressure, _, _ = self.pressure(pose)
+    def _compute_energy(self, pose: Pose) -> float:
+        pressure, _, _ = self.compute_pressure(pose)
         contact = (self.block.surface_weights * pressure**2).sum() / (2 * self.penalty)
-        return self.block.energy(self.displacement) + float(contact)
+        return self.block.compute_energy(self.displacement) + float(contact)
 
-    def _unbalanced(self, pose: Pose) -> tuple[Array, float]:
+    def _compute_imbalance(self, pose: Pose) -> tuple[Array, float]:
         """Forces (N, 3) N that nothing balances, and the norm of the contact forces."""
-        pressure, normal, _ = self.pressure(pose)
+        pressure, normal, _ = self.compute_pressure(pose)
         weighted = (self.block.surface_weights * pressure)[:, None] * normal
         pushes = self.block.surface_values.T @ weighted
-        unbalanced = (self.block.forces(self.displacement) - pushes) * self.free
+        unbalanced = (self.block.compute_forces(self.displacement) - pushes) * self.free
         return unbalanced, float(np.linalg.norm(pushes))
 
-    def _tangent(self, pose: Pose) -> bsr_array:
-        pressure, normal, curvature = self.pressure(pose)
+    def _assemble_tangent(self, pose: Pose) -> bsr_array:
+        pressure, normal, curvature = self.compute_pressure(pose)
         local = self.penalty * normal[:, :, None] * normal[:, None, :]
         local -= pressure[:, None, None] * curvature
         local *= (self.block.surface_weights * (pressure > 0))[:, None, None]
-        contact = self._surface.T @ _block_diagonal(local) @ self._surface
-        matrix = self.block.stiffness(self.displacement) + contact
-        held = _diagonal(1.0 - self.free.ravel())
+        contact = self._surface.T @ _make_block_diagonal(local) @ self._surface
+        matrix = self.block.assemble_stiffness(self.displacement) + contact
+        held = _make_diagonal(1.0 - self.free.ravel())
         return (self._mask @ matrix @ self._mask + held).tobsr((3, 3))
 
-    def _distance(self, pose: Pose) -> tuple[Array, Array, Array]:
+    def _measure_gaps(self, pose: Pose) -> tuple[Array, Array, Array]:
         """Gap (S,) m of the surface points to the probe, its gradient and its second derivative."""
         points = self.block.surface_points + self.block.surface_values @ self.displacement
         *half, rounding = self.collider.offset_box
@@ -218,7 +218,7 @@ class _Search:
         return (distance - rounding, normal @ rotation.T, rotation @ curvature @ rotation.T)
 
 
-def _solved(matrix: bsr_array, right: Array, prolongation: csr_array) -> Array:
+def _solve_system(matrix: bsr_array, right: Array, prolongation: csr_array) -> Array:
     """(3N,) about the solution of a symmetric system, by conjugate gradients.
 
     They are preconditioned by the inverse of the diagonal's blocks and by the same mesh with linear
@@ -226,7 +226,7 @@ def _solved(matrix: bsr_array, right: Array, prolongation: csr_array) -> Array:
     step may ascend.
     """
     rows = np.repeat(np.arange(len(matrix.indptr) - 1), np.diff(matrix.indptr))
-    smooth = _block_diagonal(np.linalg.inv(matrix.data[rows == matrix.indices]))
+    smooth = _make_block_diagonal(np.linalg.inv(matrix.data[rows == matrix.indices]))
     coarse = splu(
         (prolongation.T @ matrix @ prolongation).tocsc(),
         permc_spec="MMD_AT_PLUS_A",
@@ -234,25 +234,28 @@ def _solved(matrix: bsr_array, right: Array, prolongation: csr_array) -> Array:
         options={"SymmetricMode": True},
     )
 
-    def inverse(residual: Array) -> Array:
+    def apply_preconditioner(residual: Array) -> Array:
         corrected = prolongation @ coarse.solve(prolongation.T @ residual)
         return np.asarray(corrected + smooth @ residual)
 
-    goal, both = 1e-3 * float(np.linalg.norm(right)), LinearOperator(matrix.shape, inverse)
+    goal, both = (
+        1e-3 * float(np.linalg.norm(right)),
+        LinearOperator(matrix.shape, apply_preconditioner),
+    )
     found, _ = cg(matrix, right, atol=goal, maxiter=400, M=both)
     return np.asarray(found)
 
 
-def _block_diagonal(blocks: Array) -> bsr_array:
+def _make_block_diagonal(blocks: Array) -> bsr_array:
     """(3B, 3B) of blocks (B, 3, 3)."""
     return bsr_array((blocks, np.arange(len(blocks)), np.arange(len(blocks) + 1)))
 
 
-def _diagonal(entries: NDArray[np.floating]) -> dia_array:
+def _make_diagonal(entries: NDArray[np.floating]) -> dia_array:
     return dia_array((entries[None], [0]), shape=2 * entries.shape)
 
 
-def _movable(block: NeoHookeanHexahedra, points: Array) -> NDArray[np.bool_]:
+def _find_movable(block: NeoHookeanHexahedra, points: Array) -> NDArray[np.bool_]:
     """(P, 3): all but the bottom, and not out of the mirror plane."""
     free = np.ones(points.shape, dtype=bool)
     free[np.isclose(points[:, 1], block.planes[1][0]), 1] = False
@@ -260,7 +263,7 @@ def _movable(block: NeoHookeanHexahedra, points: Array) -> NDArray[np.bool_]:
     return free
 
 
-def solve_reference(scene: Scene, sizes: Sequence[float]) -> list[Solution]:
+def solve_reference(scene: BlockScene, sizes: Sequence[float]) -> list[ContactSolution]:
     """Solve the end of a scene's path on finer and finer meshes.
 
     Args:
@@ -270,11 +273,11 @@ def solve_reference(scene: Scene, sizes: Sequence[float]) -> list[Solution]:
     Raises:
         SolverError: no equilibrium was found.
     """
-    solutions: list[Solution] = []
+    solutions: list[ContactSolution] = []
     # Every second pose, and all of them where tissue hardly compresses.
     poses = scene.path[::-2][::-1] if scene.poisson_ratio <= 0.45 else scene.path
     for size in sizes:
-        start, planes = solutions[-1] if solutions else None, scene.reference_planes(size)
+        start, planes = solutions[-1] if solutions else None, scene.make_reference_planes(size)
         some = scene.path[-1:] if start else poses
         solutions.append(solve_contact(planes, scene.material, scene.collider, some, start))
     return solutions

@@ -33,19 +33,19 @@ def report_tissue(references: pd.DataFrame, points: pd.DataFrame) -> Report:
     shown = points[points["nodes"] == _NODES]
     main = points[points["scene"] == MAIN_SCENE]
     defaults = points[points["default"]]
-    fronts = {scene: _pareto_front(some) for scene, some in shown.groupby("scene", sort=False)}
+    fronts = {scene: _find_pareto_front(some) for scene, some in shown.groupby("scene", sort=False)}
     places = {
         "references": references,
         "nodes": f"{_NODES:,}",
         "error": _draw_errors(shown, "scene", "to large deformation on fine elements"),
-        "defaults": _in_percent(shown[shown["default"]]),
+        "defaults": _tabulate_errors(shown[shown["default"]]),
         "meshes": _draw_errors(main, "nodes", f"by nodes of the mesh, {SCENES[MAIN_SCENE].words}"),
         "estimates": _tabulate_estimates(defaults),
     }
-    return Report(list(_take_home(main, fronts)), places)
+    return Report(list(_list_take_home(main, fronts)), places)
 
 
-def _take_home(main: pd.DataFrame, fronts: dict[str, pd.DataFrame]) -> Iterator[str]:
+def _list_take_home(main: pd.DataFrame, fronts: dict[str, pd.DataFrame]) -> Iterator[str]:
     for p in main[main["default"] & (main["nodes"] == _NODES)].itertuples():
         yield (
             f"`{p.method}` is {100 * p.rel_l2_error:.2g} % from large deformation "
@@ -55,7 +55,7 @@ def _take_home(main: pd.DataFrame, fronts: dict[str, pd.DataFrame]) -> Iterator[
     yield f"On the front of error against run time, over all scenes, are only {', '.join(ahead)}."
 
 
-def _pareto_front(points: pd.DataFrame) -> pd.DataFrame:
+def _find_pareto_front(points: pd.DataFrame) -> pd.DataFrame:
     """Points than which no other is both faster and more accurate, fastest first."""
     ordered = points.sort_values(["ms_median", "rel_l2_error"])
     best = ordered["rel_l2_error"].cummin().shift(fill_value=np.inf)
@@ -79,7 +79,7 @@ def _draw_errors(points: pd.DataFrame, panels: str, words: str) -> Figure:
     )
 
 
-def _in_percent(points: pd.DataFrame) -> pd.DataFrame:
+def _tabulate_errors(points: pd.DataFrame) -> pd.DataFrame:
     """The rows' main columns, by the names that a reader reads."""
     table = points[["scene", "method"]].copy()
     table["ms"], table["max mm"] = points["ms_median"], points["max_error_mm"]

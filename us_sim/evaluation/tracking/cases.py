@@ -1,8 +1,8 @@
 """Bodies of markers, cameras and conditions that trackers are measured in, and views of them.
 
->>> from us_sim.evaluation.tracking.cases import Case
->>> case = Case("aruco_40mm", "640x480", 0.4, 30.0)
->>> sequence = case.sequence(0)
+>>> from us_sim.evaluation.tracking.cases import TrackingCase
+>>> case = TrackingCase("aruco_40mm", "640x480", 0.4, 30.0)
+>>> sequence = case.make_sequence(0)
 >>> len(sequence), round(float(np.linalg.norm(sequence[2].position)), 6)
 (5, 0.4)
 """
@@ -70,17 +70,17 @@ class Marker:
 
 
 MARKERS = {
-    SINGLE: Marker("one ArUco marker of 40 mm", lambda: RigidBody.single("4X4_50", 7, 0.04)),
+    SINGLE: Marker("one ArUco marker of 40 mm", lambda: RigidBody.create_single("4X4_50", 7, 0.04)),
     "apriltag_40mm": Marker(
-        "one AprilTag of 40 mm", lambda: RigidBody.single("APRILTAG_36h11", 7, 0.04)
+        "one AprilTag of 40 mm", lambda: RigidBody.create_single("APRILTAG_36h11", 7, 0.04)
     ),
     "charuco_board": Marker(
         "ChArUco, 5 × 4 squares of 24 mm, markers of 18 mm",
-        lambda: RigidBody.charuco("4X4_50", 5, 4, 0.024, 0.018),
+        lambda: RigidBody.create_charuco("4X4_50", 5, 4, 0.024, 0.018),
     ),
     "grid_board": Marker(
         "4 × 3 ArUco markers of 24 mm, 6 mm apart",
-        lambda: RigidBody.grid("4X4_50", 4, 3, 0.024, 0.006),
+        lambda: RigidBody.create_grid("4X4_50", 4, 3, 0.024, 0.006),
     ),
     RIGID_BODY: Marker(
         "6 markers of 30 mm on three facets, 4 visible at 0°",
@@ -93,7 +93,7 @@ MARKERS = {
 
 
 @dataclass(frozen=True)
-class Case:
+class TrackingCase:
     """A body seen from a distance at an angle, again and again."""
 
     marker: str
@@ -102,26 +102,31 @@ class Case:
     angle: float  # degrees, from the line of sight to the body's front
     condition: str = "plain"
 
-    def sequence(self, number: int) -> list[Pose]:
+    @property
+    def key(self) -> str:
+        """The text that random seeds come from, as of the published tables."""
+        return repr(self).removeprefix("Tracking")
+
+    def make_sequence(self, number: int) -> list[Pose]:
         """Poses of the body in ``camera_optical``, `FRAMES` of them; the middle one as asked."""
-        random = np.random.default_rng([zlib.crc32(repr(self).encode()), number])
+        random = np.random.default_rng([zlib.crc32(self.key.encode()), number])
         camera, seen = WEBCAMS[self.image_size], MARKERS[self.marker]
         size = np.array([camera.width, camera.height])
         pixel = size * (0.5 + random.uniform(-0.12, 0.12, 2))
-        place = np.append(camera.rays(pixel[None])[0], 1.0)
+        place = np.append(camera.compute_rays(pixel[None])[0], 1.0)
         place *= self.distance / np.linalg.norm(place)
         about = random.uniform(0, 2 * np.pi)
         tilt = np.radians(self.angle) * np.array([np.cos(about), np.sin(about), 0.0])
         spin = np.array([0.0, 0.0, random.uniform(0, 2 * np.pi)])
         turn = (
-            _turn(_between(np.array([0.0, 0.0, 1.0]), place))
-            @ _turn(tilt)
-            @ _turn(spin)
-            @ _turn(_between(seen.front, np.array([0.0, 0.0, -1.0])))
+            _make_turn(_find_rotation(np.array([0.0, 0.0, 1.0]), place))
+            @ _make_turn(tilt)
+            @ _make_turn(spin)
+            @ _make_turn(_find_rotation(seen.front, np.array([0.0, 0.0, -1.0])))
         )
         middle = seen.body.centres.mean(axis=0)
         asked = Pose(place - turn.rotation @ middle, turn.orientation)
-        velocity = self.velocity(number)
+        velocity = self.compute_velocity(number)
         poses = []
         for frame in range(FRAMES):
             moved = exp((frame - FRAMES // 2) / _RATE * velocity)
@@ -131,41 +136,45 @@ class Case:
             poses.append(Pose(position, turned.orientation))
         return poses
 
-    def velocity(self, number: int) -> Array:
+    def compute_velocity(self, number: int) -> Array:
         """(6,) m/s and rad/s, of a sequence's middle, along the camera's axes."""
-        random = np.random.default_rng([zlib.crc32(repr(self).encode()), number, 1])
+        random = np.random.default_rng([zlib.crc32(self.key.encode()), number, 1])
         directions = random.normal(size=(2, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         haste = _HASTE if self.condition == "blur" else 1.0
         return haste * np.concatenate([_SPEED * directions[0], _TURNING * directions[1]])
 
-    def motion(self, number: int) -> Array | None:
+    def compute_motion(self, number: int) -> Array | None:
         """(6,) from the beginning to the end of the exposure; None where it is too short."""
-        return _EXPOSURE * self.velocity(number) if self.condition == "blur" else None
+        return _EXPOSURE * self.compute_velocity(number) if self.condition == "blur" else None
 
 
-def cases(quick: bool) -> list[Case]:
+def list_cases(quick: bool) -> list[TrackingCase]:
     """All that is measured, in order."""
     distances = (0.4, 0.9) if quick else (0.2, 0.3, 0.4, 0.6, 0.9, 1.3)
     angles = (0.0, 30.0, 60.0) if quick else (0.0, 15.0, 30.0, 45.0, 60.0, 70.0)
     tilted = (30.0,) if quick else (0.0, 30.0, 60.0)
     found = []
     for name in MARKERS:
-        found += [Case(name, SMALL, d, a) for d in distances for a in angles]
-        found += [Case(name, SMALL, 0.4, a, c) for c in CONDITIONS if c != "plain" for a in tilted]
+        found += [TrackingCase(name, SMALL, d, a) for d in distances for a in angles]
         found += [
-            Case(name, LARGE, d, a) for d in ((0.4,) if quick else (0.4, 0.9)) for a in tilted
+            TrackingCase(name, SMALL, 0.4, a, c) for c in CONDITIONS if c != "plain" for a in tilted
+        ]
+        found += [
+            TrackingCase(name, LARGE, d, a)
+            for d in ((0.4,) if quick else (0.4, 0.9))
+            for a in tilted
         ]
         if not quick:
-            found += [Case(name, LARGE, 0.4, 30.0, c) for c in CONDITIONS if c != "plain"]
+            found += [TrackingCase(name, LARGE, 0.4, 30.0, c) for c in CONDITIONS if c != "plain"]
     return found
 
 
-def _turn(vector: Array) -> Pose:
+def _make_turn(vector: Array) -> Pose:
     return Pose(np.zeros(3), rotation_exp(vector))
 
 
-def _between(one: Array, other: Array) -> Array:
+def _find_rotation(one: Array, other: Array) -> Array:
     """(3,) rad, of the shortest rotation from one direction to another."""
     one, other = one / np.linalg.norm(one), other / np.linalg.norm(other)
     axis = np.cross(one, other)

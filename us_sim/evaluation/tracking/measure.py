@@ -1,8 +1,8 @@
 """A tracker's errors, failures and run time in one case.
 
->>> from us_sim.evaluation.tracking.measure import mirrored
+>>> from us_sim.evaluation.tracking.measure import mirror_pose
 >>> tilted = Pose([0.0, 0.0, 0.4], [np.sin(0.1), 0.0, 0.0, np.cos(0.1)])
->>> mirrored(tilted, np.zeros(3), np.array([0.0, 0.0, 1.0])).orientation.round(4) + 0.0
+>>> mirror_pose(tilted, np.zeros(3), np.array([0.0, 0.0, 1.0])).orientation.round(4) + 0.0
 array([-0.0998,  0.    ,  0.    ,  0.995 ])
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, Case, Marker
+from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, Marker, TrackingCase
 from us_sim.geometry.pose import Pose
 from us_sim.tracking.camera.body_pose import rotation_angle
 from us_sim.tracking.camera.rendered_views import WEBCAMS, RenderedView
@@ -25,13 +25,13 @@ from us_sim.tracking.camera.source import VIEW_ANGLE_LIMIT, CameraSource
 from us_sim.tracking.measurement import Measurement
 
 
-class Tracking:
+class TrackingBench:
     """Renders cases and tracks them; keeps the room of the last body."""
 
     def __init__(self) -> None:
         self._rooms: dict[tuple[str, str], RenderedView] = {}
 
-    def row(self, case: Case, sequences: int) -> list[dict[str, Any]]:
+    def measure_case(self, case: TrackingCase, sequences: int) -> list[dict[str, Any]]:
         """Row of a case, from so many sequences of images; its ``shots`` are a row a view."""
         seen, camera = MARKERS[case.marker], WEBCAMS[case.image_size]
         key = (case.marker, case.image_size)
@@ -46,14 +46,14 @@ class Tracking:
         try:
             for number in range(sequences):
                 source = CameraSource(camera, seen.body)
-                seed = zlib.crc32(f"{case} {number}".encode())
-                for frame, pose in enumerate(case.sequence(number)):
+                seed = zlib.crc32(f"{case.key} {number}".encode())
+                for frame, pose in enumerate(case.make_sequence(number)):
                     # The hand and the light stay as they are through a sequence, not the noise.
-                    image = room.render(pose, conditions, seed, case.motion(number), frame)
+                    image = room.render(pose, conditions, seed, case.compute_motion(number), frame)
                     if is_new:  # what is compiled now must not count
-                        CameraSource(camera, seen.body).measure(image, 0)
+                        CameraSource(camera, seen.body).measure_pose(image, 0)
                         is_new = False
-                    rows.append(_view(source, seen, frame, pose, image))
+                    rows.append(_measure_view(source, seen, frame, pose, image))
         finally:
             cv2.setNumThreads(threads)
         views = pd.DataFrame(rows)
@@ -76,41 +76,41 @@ class Tracking:
         ]
 
 
-def _view(
+def _measure_view(
     source: CameraSource, seen: Marker, frame: int, true: Pose, image: NDArray[np.uint8]
 ) -> dict[str, Any]:
     """What the tracker says of one image, and how far it is off."""
     begin, processor = time.perf_counter(), time.thread_time()
-    measured = source.measure(image, round(frame * 1e9 / 30))
+    measured = source.measure_pose(image, round(frame * 1e9 / 30))
     processor, wall = time.thread_time() - processor, time.perf_counter() - begin
     return {
         "first": frame == 0,  # of a sequence: nothing was known before
         "ms": 1e3 * wall,
         "cpu_ms": 1e3 * processor,
-        "visible": visible(seen, true),
+        "visible": count_visible(seen, true),
         "detected": measured is not None,
         "used": source.seen if measured else 0,
-        **_compared(measured, seen, true),
+        **_compare_poses(measured, seen, true),
     }
 
 
-def visible(seen: Marker, pose: Pose) -> int:
+def count_visible(seen: Marker, pose: Pose) -> int:
     """How many markers of a body face the camera, by less than its usual limit of the angle."""
-    centres = pose.apply(seen.body.centres)
+    centres = pose.transform_points(seen.body.centres)
     cosines = -((seen.body.normals @ pose.rotation.T) * centres).sum(axis=1)
     cosines /= np.linalg.norm(centres, axis=1)
     return int((cosines > np.cos(VIEW_ANGLE_LIMIT)).sum())
 
 
-def _compared(measured: Measurement | None, seen: Marker, true: Pose) -> dict[str, Any]:
+def _compare_poses(measured: Measurement | None, seen: Marker, true: Pose) -> dict[str, Any]:
     """Errors of the body's middle and turn."""
     if measured is None:
         return {"flipped": False, "mm": np.nan, "degrees": np.nan}
     found = measured.pose
     middle = seen.body.centres.mean(axis=0)
-    off = (found.apply(middle[None]) - true.apply(middle[None]))[0]
+    off = (found.transform_points(middle[None]) - true.transform_points(middle[None]))[0]
     angle = rotation_angle(found, true)
-    other = rotation_angle(found, mirrored(true, middle, seen.front))
+    other = rotation_angle(found, mirror_pose(true, middle, seen.front))
     return {
         "flipped": bool(other < angle and angle > np.radians(5.0)),
         "mm": 1e3 * float(np.linalg.norm(off)),
@@ -118,13 +118,13 @@ def _compared(measured: Measurement | None, seen: Marker, true: Pose) -> dict[st
     }
 
 
-def mirrored(pose: Pose, middle: NDArray[np.float64], front: NDArray[np.float64]) -> Pose:
+def mirror_pose(pose: Pose, middle: NDArray[np.float64], front: NDArray[np.float64]) -> Pose:
     """The pose that a plane seen from afar may be taken for: tilted to the other side.
 
     The pose is of the body in ``camera_optical``; its middle (3,) m, and the unit normal (3,) of
     its front, are in its own frame.
     """
-    sight = pose.apply(middle[None])[0]
+    sight = pose.transform_points(middle[None])[0]
     sight = sight / np.linalg.norm(sight)
     matrix = np.eye(4)
     before, behind = np.eye(3) - 2 * np.outer(sight, sight), np.eye(3) - 2 * np.outer(front, front)

@@ -23,10 +23,10 @@ from us_sim.evaluation.tracking.cases import (
     RIGID_BODY,
     SINGLE,
     SMALL,
-    Case,
-    cases,
+    TrackingCase,
+    list_cases,
 )
-from us_sim.evaluation.tracking.measure import Tracking
+from us_sim.evaluation.tracking.measure import TrackingBench
 from us_sim.tracking.camera.rendered_views import WEBCAMS, RenderedView
 
 _QUICK_SEQUENCES = {SMALL: 5, LARGE: 3}  # sequences of views a case, by the size of the images
@@ -34,12 +34,12 @@ _SEQUENCES = {SMALL: 12, LARGE: 8}
 _ERRORS = {"median_mm": "position, mm", "median_deg": "rotation, degrees"}
 
 
-def _pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
-    tracking = Tracking()
-    return {"tracking": [_case_piece(tracking, case, quick) for case in cases(quick)]}
+def _plan_pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
+    tracking = TrackingBench()
+    return {"tracking": [_plan_case(tracking, case, quick) for case in list_cases(quick)]}
 
 
-def _case_piece(tracking: Tracking, case: Case, quick: bool) -> Piece:
+def _plan_case(tracking: TrackingBench, case: TrackingCase, quick: bool) -> Piece:
     sequences = (_QUICK_SEQUENCES if quick else _SEQUENCES)[case.image_size]
     if case.condition == "plain" and case.marker in (SINGLE, RIGID_BODY):
         sequences *= 3  # the targets are about these
@@ -50,7 +50,7 @@ def _case_piece(tracking: Tracking, case: Case, quick: bool) -> Piece:
         "angle_deg": case.angle,
         "condition": case.condition,
     }
-    return Piece(columns, partial(tracking.row, case, sequences))
+    return Piece(columns, partial(tracking.measure_case, case, sequences))
 
 
 def _report(table: pd.DataFrame) -> Report:
@@ -102,7 +102,7 @@ def _report(table: pd.DataFrame) -> Report:
             "Median error over the angle, at 0.4 m, 640 × 480",
         ),
         "run_time": draw_error_over_time(
-            _melted(plain[plain["distance_m"] == 0.4]),
+            _melt_errors(plain[plain["distance_m"] == 0.4]),
             "cpu_ms_median",
             "error",
             "Median error over run time at 0.4 m (full: 640 × 480; hollow: 1920 × 1080)",
@@ -134,7 +134,7 @@ def _tabulate_conditions(shots: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _melted(table: pd.DataFrame) -> pd.DataFrame:
+def _melt_errors(table: pd.DataFrame) -> pd.DataFrame:
     """A row an error; ``small`` are the smaller images."""
     rows = table.assign(small=table["image_size"] == SMALL)
     kept = [name for name in rows.columns if name not in _ERRORS]
@@ -145,7 +145,7 @@ def _melted(table: pd.DataFrame) -> pd.DataFrame:
 def _draw_errors(table: pd.DataFrame, parameter: str, title: str) -> Figure:
     labels = {"distance_m": "distance, m", "angle_deg": "angle, degrees", "error": ""}
     look: Any = {"panels": "of", "lines": "marker", "share_y": False, "labels": labels}
-    return draw_error_over_parameter(_melted(table), parameter, "error", title, **look)
+    return draw_error_over_parameter(_melt_errors(table), parameter, "error", title, **look)
 
 
 def _draw_views() -> Figure:
@@ -156,10 +156,12 @@ def _draw_views() -> Figure:
     for condition, (settings, _) in CONDITIONS.items():
         grid[condition] = {}
         for name, room in rooms.items():
-            case = Case(name, SMALL, 0.4, 30.0, condition)
-            pose, body = case.sequence(0)[0], MARKERS[name].body
-            image = room.render(pose, settings, 3, case.motion(0))
-            middle = WEBCAMS[SMALL].project(pose.apply(body.centres.mean(axis=0)[None]))[0]
+            case = TrackingCase(name, SMALL, 0.4, 30.0, condition)
+            pose, body = case.make_sequence(0)[0], MARKERS[name].body
+            image = room.render(pose, settings, 3, case.compute_motion(0))
+            middle = WEBCAMS[SMALL].project_points(
+                pose.transform_points(body.centres.mean(axis=0)[None])
+            )[0]
             left, top = np.clip(middle - cut / 2, 0, np.array(image.shape)[::-1] - cut).astype(int)
             grid[condition][name] = image[top : top + cut, left : left + cut]
     return draw_image_grid(grid, "Bodies and conditions, at 0.4 m and 30°")
@@ -168,7 +170,7 @@ def _draw_views() -> Figure:
 TRACKING = Subject(
     "tracking",
     "Tracking: error against run time",
-    _pieces,
+    _plan_pieces,
     _report,
     hidden=("shots",),
     libraries=("opencv-python-headless", "opencv-python"),

@@ -1,7 +1,7 @@
 """Run the arm with a viewer, and look at it with real browsers.
 
->>> from us_sim.evaluation.viewer.measure import cases
->>> [str(case) for case in cases(quick=True)][:2]
+>>> from us_sim.evaluation.viewer.measure import list_cases
+>>> [str(case) for case in list_cases(quick=True)][:2]
 ['no viewer, path', 'viewer without a page, path']
 """
 
@@ -18,13 +18,18 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.processes import Simulation, UsageOverTime, listening, simulating
-from us_sim.evaluation.report import percentile
+from us_sim.evaluation.processes import (
+    SimulatorProcess,
+    UsageOverTime,
+    record_arrivals,
+    run_simulator,
+)
+from us_sim.evaluation.report import compute_percentile
 from us_sim.share import find_bag
 
 
 @dataclass(frozen=True)
-class Case:
+class ViewerCase:
     """One way to run the scene ``upper_arm`` with `us-sim`."""
 
     who: str  # looks: "no viewer", "viewer without a page", or "1 browser"
@@ -35,13 +40,13 @@ class Case:
         return f"{self.who}, {'hand' if self.by_hand else 'path'}"
 
 
-def cases(quick: bool) -> list[Case]:
+def list_cases(quick: bool) -> list[ViewerCase]:
     """Cases of a run; in a quick one each takes some seconds."""
     chosen = [
-        Case("no viewer"),
-        Case("viewer without a page"),
-        Case(BROWSER, seconds=130.0),
-        Case(BROWSER, by_hand=True),
+        ViewerCase("no viewer"),
+        ViewerCase("viewer without a page"),
+        ViewerCase(BROWSER, seconds=130.0),
+        ViewerCase(BROWSER, by_hand=True),
     ]
     return [replace(case, seconds=8.0) for case in chosen] if quick else chosen
 
@@ -67,7 +72,7 @@ MOVE = """([x, y, seconds]) => new Promise((resolve) => {
 
 
 @contextlib.contextmanager
-def showing(simulation: Simulation) -> Iterator[Page]:
+def show_page(simulation: SimulatorProcess) -> Iterator[BrowserPage]:
     """Show the simulation's page in Chromium.
 
     Raises:
@@ -80,8 +85,8 @@ def showing(simulation: Simulation) -> Iterator[Page]:
     chromium = os.environ.get("US_SIM_TEST_CHROMIUM") or shutil.which("chromium")
     if not chromium:
         raise UsSimError("there is no chromium on PATH: install it to have it measured")
-    while not (found := _ADDRESS.search(simulation.said())):
-        simulation.check()
+    while not (found := _ADDRESS.search(simulation.read_output())):
+        simulation.require_running()
         time.sleep(0.005)
     with sync_playwright() as tool:
         # As where there is no graphics card.
@@ -93,23 +98,23 @@ def showing(simulation: Simulation) -> Iterator[Page]:
         page.goto(found[0])
         page.wait_for_function("window.usSim?.images?.() > 0", timeout=60_000)
         shown = time.monotonic()
-        yield Page(page, opened=shown - began, started=shown - simulation.began)
+        yield BrowserPage(page, opened=shown - began, started=shown - simulation.began)
         browser.close()
 
 
 @dataclass
-class Page:
+class BrowserPage:
     """A page in a browser; without one nothing is shown."""
 
     page: Any = None
     opened: float = math.nan  # s, from opening the page to its first image
     started: float = math.nan  # s, likewise, from the command
 
-    def images(self) -> float:
+    def count_images(self) -> float:
         """How many images the page has drawn."""
         return float(self.page.evaluate("window.usSim.images()")) if self.page else math.nan
 
-    def wait(self, seconds: float, *, drag: bool) -> None:
+    def wait_or_drag(self, seconds: float, *, drag: bool) -> None:
         """Let so long pass, dragging the probe with the mouse over the page's image."""
         if not self.page:
             time.sleep(max(seconds, 0.0))
@@ -124,7 +129,7 @@ class Page:
         self.page.evaluate(MOVE, [x, y, seconds])
         self.page.mouse.up()
 
-    def delays(self) -> dict[str, float]:
+    def read_delays(self) -> dict[str, float]:
         """ms from the pointer to the pixels: median and 99th percentile, and how many there are."""
         found = self.page.evaluate("window.usSim.latency()") if self.page else {}
         return {
@@ -135,7 +140,7 @@ class Page:
 _ADDRESS = re.compile(r"http://\S+")
 
 
-def run_case(case: Case) -> list[dict[str, Any]]:
+def run_case(case: ViewerCase) -> list[dict[str, Any]]:
     """Look at the arm as the case says, and return its row.
 
     Raises:
@@ -144,31 +149,33 @@ def run_case(case: Case) -> list[dict[str, Any]]:
     path = ["--path", str(find_bag("press_and_slide.mcap")), "--param", "path_player.loop=true"]
     command = ["run"] if case.who == "no viewer" else ["view", "--port", "0"]
     with (
-        listening() as arrivals,
-        simulating(*command, "upper_arm", *([] if case.by_hand else path)) as simulation,
-        showing(simulation) if case.who == BROWSER else contextlib.nullcontext(Page()) as page,
+        record_arrivals() as arrivals,
+        run_simulator(*command, "upper_arm", *([] if case.by_hand else path)) as simulation,
+        show_page(simulation)
+        if case.who == BROWSER
+        else contextlib.nullcontext(BrowserPage()) as page,
     ):
-        simulation.await_images(arrivals)
-        page.wait(2.0, drag=case.by_hand)  # these images do not count
+        simulation.await_image(arrivals)
+        page.wait_or_drag(2.0, drag=case.by_hand)  # these images do not count
         usage = UsageOverTime(os.getpid())  # browsers, too
-        began, began_ns, shown = time.monotonic(), time.time_ns(), page.images()
+        began, began_ns, shown = time.monotonic(), time.time_ns(), page.count_images()
         while (passed := time.monotonic() - began) < case.seconds:
-            simulation.check()
+            simulation.require_running()
             usage.update()
-            page.wait(min(2.0, case.seconds - passed), drag=case.by_hand)
+            page.wait_or_drag(min(2.0, case.seconds - passed), drag=case.by_hand)
         ended_ns, seconds = time.time_ns(), time.monotonic() - began
-        drawn, delays = page.images() - shown, page.delays()
-        heard = arrivals.heard_between(began_ns, ended_ns)
+        drawn, delays = page.count_images() - shown, page.read_delays()
+        heard = arrivals.list_arrivals_between(began_ns, ended_ns)
     images = {stamp for stamp, _ in heard["ultrasound/image"]}
     poses = {stamp for stamp, _ in heard["tracker/pose"]}
     ages = [1e-6 * (came - stamp) for stamp, came in heard["ultrasound/image"]]
-    used = usage.columns()
+    used = usage.make_columns()
     return [
         {
             "images_a_second_made": len(images) / seconds,
             "poses_skipped_percent": 100.0 * len(poses - images) / max(len(poses), 1),
-            "image_age_ms_p50": percentile(ages, 50),
-            "image_age_ms_p99": percentile(ages, 99),
+            "image_age_ms_p50": compute_percentile(ages, 50),
+            "image_age_ms_p99": compute_percentile(ages, 99),
             "images_a_second_shown": drawn / seconds,
             "delay_ms_median": delays["median"],
             "delay_ms_p99": delays["p99"],

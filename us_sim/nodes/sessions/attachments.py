@@ -13,9 +13,9 @@ import yaml
 
 from us_sim.errors import BagError, UsSimError
 from us_sim.nodes.settings import SessionRecorderSettings
-from us_sim.recording.attached_files import versions
-from us_sim.recording.storage import bag_files
-from us_sim.scene.reading import parse_scene, scene_document, with_path, with_volume
+from us_sim.recording.attached_files import list_versions
+from us_sim.recording.storage import find_bag_files
+from us_sim.scene.reading import parse_scene, read_scene_document, with_path, with_volume
 from us_sim.settings.setting import rules_of
 from us_sim.share import full_path
 
@@ -23,7 +23,7 @@ LARGEST = 4 * 1024 * 1024
 """Bytes of a file that is attached itself; of larger ones, such as volumes, the checksum is."""
 
 
-def session_attachments(settings: SessionRecorderSettings) -> dict[str, tuple[str, bytes]]:
+def collect_attachments(settings: SessionRecorderSettings) -> dict[str, tuple[str, bytes]]:
     """Media types and contents by file names.
 
     ``scene.yaml`` is the scene with all that it is based on. It names attached files as they are
@@ -32,7 +32,7 @@ def session_attachments(settings: SessionRecorderSettings) -> dict[str, tuple[st
     Raises:
         UsSimError: there is no such scene or file, or it cannot be read.
     """
-    attached = {"versions.txt": ("text/plain", versions().encode())}
+    attached = {"versions.txt": ("text/plain", list_versions().encode())}
     if settings.parameters:
         attached["parameters.yaml"] = "application/yaml", settings.parameters.encode()
     listed: dict[Path, str] = {}  # checksums
@@ -45,7 +45,7 @@ def session_attachments(settings: SessionRecorderSettings) -> dict[str, tuple[st
         if not path.is_file():
             raise BagError(f"{path} cannot be attached: it is no file")
         if is_large:
-            listed[path] = checksum(path)
+            listed[path] = file_checksum(path)
         else:
             _attach(attached, path)
     if settings.scene is not None:
@@ -60,7 +60,7 @@ def _attach_scene(
     attached: dict[str, tuple[str, bytes]], settings: SessionRecorderSettings
 ) -> dict[Path, str]:
     """Attach a scene and its small files; the checksums of all its files."""
-    document, folders, origin = scene_document(str(settings.scene))
+    document, folders, origin = read_scene_document(str(settings.scene))
     if settings.volume:
         document = with_volume(document, settings.volume)
     if settings.path:
@@ -69,25 +69,25 @@ def _attach_scene(
     places = {}
     scene = parse_scene(document, origin=origin, folders=folders)
     for path in sorted(set(_files(scene))):
-        parts = parts_of(path)
+        parts = find_files(path)
         small = sum(part.stat().st_size for part in parts if part.is_file()) <= LARGEST
         whole = small and all(
             part.is_file() and _attach(attached, part, str(part.relative_to(path.parent)))
             for part in parts
         )
         places[path] = path.name if whole else str(path)
-        listed |= {part: checksum(part) for part in parts}
+        listed |= {part: file_checksum(part) for part in parts}
     text = yaml.safe_dump(_placed(document, places), sort_keys=False, allow_unicode=True)
     attached["scene.yaml"] = "application/yaml", text.encode()
     return listed
 
 
-def parts_of(path: Path) -> list[Path]:
+def find_files(path: Path) -> list[Path]:
     """The files of a bag, a case, a series of DICOM or another folder; or the file itself."""
     if not path.is_dir():
         return [path]
     try:
-        return bag_files(path)
+        return find_bag_files(path)
     except (BagError, OSError):
         return sorted(file for file in path.rglob("*") if file.is_file())
 
@@ -136,7 +136,7 @@ def _placed(document: Any, places: dict[Path, str]) -> Any:
     return document
 
 
-def checksum(path: Path) -> str:
+def file_checksum(path: Path) -> str:
     """SHA-256 in hexadecimal digits; dashes for what is no file.
 
     Raises:

@@ -20,7 +20,7 @@ from us_sim.recording.playhead import Playhead
 from us_sim.share import find_bag
 
 
-class Player(GuardedNode):
+class RecordingPlayer(GuardedNode):
     """Does as the parameters of a player say, and its service ``~/stop``.
 
     It publishes ``/clock`` where its parameter ``clock`` asks for that, and then goes by the
@@ -33,7 +33,7 @@ class Player(GuardedNode):
 
     def __init__(self, name: str, settings: PlayerSettings, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
-        self._live = LiveSettings(self, {"player": settings}, use=lambda _: self.use())
+        self._live = LiveSettings(self, {"player": settings}, use=lambda _: self.apply_settings())
         chosen = self.settings
         if not chosen.path:
             raise BagError(f"{name}'s parameter `path` is missing; name a bag to play")
@@ -48,10 +48,10 @@ class Player(GuardedNode):
         self._latest = 0  # ns, of `now`
         self.clock = Clock() if chosen.clock else self.get_clock()
         if chosen.clock:
-            self._clock_messages = self.stream(ClockMessage, "/clock")
-            self.create_timer(1.0 / chosen.clock, self.tell_time)
+            self._clock_messages = self.create_stream_publisher(ClockMessage, "/clock")
+            self.create_timer(1.0 / chosen.clock, self.publish_time)
         self.add_post_set_parameters_callback(self._seek)
-        self.offer("stop", self._stop)
+        self.create_command("stop", self._stop)
 
     @property
     def settings(self) -> Any:
@@ -69,7 +69,7 @@ class Player(GuardedNode):
     def send_due(self) -> bool:
         """Send what is due; return whether it is at its end."""
 
-    def hold(self) -> None:
+    def hold_still(self) -> None:
         """Do what is to be done while nothing moves."""
 
     def describe_progress(self) -> dict[str, str]:
@@ -84,16 +84,16 @@ class Player(GuardedNode):
         """ns, of the clock that the player goes by; 0 where simulated time has not begun."""
         now = int(self.clock.now().nanoseconds)
         if now < self._latest:
-            self.head.go_to(self.head.position(self._latest), now)
+            self.head.go_to(self.head.compute_position(self._latest), now)
         self._latest = now
         return now
 
     @property
     def position(self) -> int:
         """ns from the recording's start, within it."""
-        return min(max(self.head.position(self.now), 0), self.length)
+        return min(max(self.head.compute_position(self.now), 0), self.length)
 
-    def tell_time(self) -> TimeMessage:
+    def publish_time(self) -> TimeMessage:
         """Return the present time: of the recording where ``/clock`` is, which is published."""
         if not self.settings.clock:
             return self.get_clock().now().to_msg()
@@ -102,17 +102,17 @@ class Player(GuardedNode):
             self._clock_messages.publish(ClockMessage(clock=stamp))
         return stamp
 
-    def begin(self) -> None:
+    def begin_playing(self) -> None:
         """Obey parameters from now on, and those that are set already."""
         self.has_begun = True
-        self.use()
+        self.apply_settings()
 
-    def use(self) -> None:
+    def apply_settings(self) -> None:
         """Go on at the rate that was set, or hold still; before it began there is nothing to do."""
         if not self.has_begun:
             return
-        self.head.run_at(self.settings.rate, self.now)
-        self.head.hold(self.settings.paused, self.now)
+        self.head.set_rate(self.settings.rate, self.now)
+        self.head.set_held(self.settings.paused, self.now)
         if self.health.state != "finished" or self._loops:
             self._play()
         self._report()
@@ -120,7 +120,7 @@ class Player(GuardedNode):
     def play_on(self) -> None:
         """Send what is due, and at the end begin anew, or be done; called again and again."""
         if self.health.state == "finished" and not self._loops:
-            self.hold()
+            self.hold_still()
             return
         is_over = self.health.state == "finished" or self.send_due()
         self.health.values = self.describe_progress()
@@ -172,4 +172,4 @@ class Player(GuardedNode):
 
     def _report(self) -> None:
         self.health.values = self.describe_progress()
-        self.health.report()
+        self.health.publish_report()

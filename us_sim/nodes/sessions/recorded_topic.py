@@ -14,7 +14,7 @@ from rosbags.interfaces import Qos, QosDurability, QosReliability
 
 from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.recording.schemas import schema_text
+from us_sim.recording.schemas import make_schema
 
 QUEUE = 1000  # messages that may wait for the executor
 
@@ -60,7 +60,7 @@ class RecordedTopic:
         """Whether its publishers keep messages for those who come later."""
         return self._adopted.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
-    def follow(self, offered: list[Qos]) -> list[Qos]:
+    def adopt_offers(self, offered: list[Qos]) -> list[Qos]:
         """Follow the qualities that publishers offer now; those that none has offered before."""
         if len(offered) != self._publishers:
             self._publishers, self._sequence = len(offered), None
@@ -68,13 +68,13 @@ class RecordedTopic:
         self._offered |= dict.fromkeys(new)
         adopted = _adopted(self._offered)
         if adopted != self._adopted:
-            self.take_rest()
+            self.take_remaining()
             self._node.destroy_subscription(self._subscription)
             self._adopted, self._sequence = adopted, None
             self._subscription = self._subscribed()
         return new
 
-    def take_rest(self) -> None:
+    def take_remaining(self) -> None:
         """Take the messages that wait for the executor; also after ROS was shut down."""
         handle = self._subscription.handle
         with handle:
@@ -86,7 +86,7 @@ class RecordedTopic:
         return self._node.create_subscription(
             self._type,
             self.name,
-            self._node.guarded(self.name, self._receive_all),
+            self._node.guard_callback(self.name, self._receive_all),
             self._adopted,
             raw=True,
             event_callbacks=events,
@@ -95,7 +95,7 @@ class RecordedTopic:
     def _receive_all(self, data: bytes, info: Mapping[str, Any]) -> None:
         """Take this message and all that wait behind it: a turn of the executor costs more."""
         self._receive(data, info)
-        self.take_rest()
+        self.take_remaining()
 
     def _receive(self, data: bytes, info: Mapping[str, Any]) -> None:
         self._count(info.get("publication_sequence_number"))
@@ -153,7 +153,7 @@ def message_type(name: str) -> Any:
     if match is None:
         shown = name if len(name) < 100 else f"{name[:100]}…"
         raise BagError(f"{shown!r} is no message type of ROS 2")
-    schema_text(name)
+    make_schema(name)
     package, short = match.groups()
     try:
         return getattr(importlib.import_module(f"{package}.msg"), short)

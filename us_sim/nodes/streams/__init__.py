@@ -6,13 +6,13 @@ Only those are there that a scene and its volume can provide.
 from __future__ import annotations
 
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.nodes.streams.stream import IMAGE, FrameStream, m_mode_stream
+from us_sim.nodes.streams.stream import IMAGE, FrameStream, create_m_mode_stream
 from us_sim.slicing.probe.probe import Probe
-from us_sim.slicing.strain import displacement
+from us_sim.slicing.strain import compute_displacement
 from us_sim.volume.volume import Volume
 
 
-def frame_streams(node: SceneNode, volume: Volume, probe: Probe) -> list[FrameStream]:
+def create_frame_streams(node: SceneNode, volume: Volume, probe: Probe) -> list[FrameStream]:
     """All that can be made of the frames of the node's scene, in the order of making; prepared.
 
     Raises:
@@ -22,15 +22,15 @@ def frame_streams(node: SceneNode, volume: Volume, probe: Probe) -> list[FrameSt
     if volume.labels is not None:
         further.append(FrameStream(node, "ultrasound/labels", lambda frame: frame.labels))
     if node.scene.tissue is not None:
-        from us_sim.nodes.streams.strain import strain_streams
+        from us_sim.nodes.streams.strain import create_strain_streams
 
-        further.append(FrameStream(node, "ultrasound/displacement", displacement))
-        further += strain_streams(node)
+        further.append(FrameStream(node, "ultrasound/displacement", compute_displacement))
+        further += create_strain_streams(node)
     if node.scene.flows:
-        from us_sim.nodes.streams.doppler import doppler_streams
+        from us_sim.nodes.streams.doppler import create_doppler_streams
 
-        further += doppler_streams(node, volume)
-    further.append(m_mode_stream(node))
+        further += create_doppler_streams(node, volume)
+    further.append(create_m_mode_stream(node))
     for stream in further:
         stream.prepare(probe)
     # Whoever waits for the images may begin when their topic is there, so it comes last.

@@ -15,12 +15,12 @@ from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.messages import image_message
 from us_sim.nodes.parameters import LiveSettings
-from us_sim.nodes.scene_node import SceneNode, poses_ended
+from us_sim.nodes.scene_node import SceneNode, explain_missing_poses
 from us_sim.nodes.settings import AnnotatedImageSettings
 from us_sim.nodes.streams.stream import FrameStream
-from us_sim.scene.building import colour_of
+from us_sim.scene.building import structure_colour
 from us_sim.slicing.drawing.annotation import Annotation, Badge
-from us_sim.slicing.drawing.label_outlines import onto_border
+from us_sim.slicing.drawing.label_outlines import snap_to_border
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
@@ -29,7 +29,7 @@ from us_sim.slicing.settings import OVERLAYS
 _TOPIC = "ultrasound/image_annotated"
 
 
-class Age:
+class MessageAge:
     """The time since something came last, whatever its stamp says.
 
     A stamp may be of another clock, such as that of a tracker which is ahead, or of the day it was
@@ -97,14 +97,14 @@ class AnnotatedImage:
         self._require_overlay(self._live.values)
         numbers = {name: number for number, name in label_names.items()}
         self._structures = {
-            numbers[given.label or name]: (name, colour_of(node.scene, name))
+            numbers[given.label or name]: (name, structure_colour(node.scene, name))
             for name, given in node.scene.structures.items()
             if not given.file and (given.label or name) in numbers
         }
-        self._publisher = node.stream(Image, _TOPIC)
+        self._publisher = node.create_stream_publisher(Image, _TOPIC)
         self._missing = False
-        self._pose_age, self._image_age = Age(node), Age(node)
-        self.show_probe(probe)
+        self._pose_age, self._image_age = MessageAge(node), MessageAge(node)
+        self.change_probe(probe)
         if not node.lockstep:
             node.create_timer(1.0 / CHECKS, self._check)
 
@@ -124,7 +124,7 @@ class AnnotatedImage:
             return "live"
         return "lost" if age > shown.lost_after else "stale"
 
-    def show_probe(self, probe: Probe) -> None:
+    def change_probe(self, probe: Probe) -> None:
         """The images that come are of another probe; those before it are not shown again."""
         self._probe = probe
         is_flipped = self._live.values["shown"].flip
@@ -132,11 +132,11 @@ class AnnotatedImage:
         self._frame: Frame | None = None
         self._stamp = TimeMessage()  # zero: of a picture of no pose
 
-    def pose_came(self) -> None:
+    def on_usable_pose(self) -> None:
         """A pose that can be used has come, whether or not an image is made at it."""
         self._pose_age.restart()
 
-    def show(self, frame: Frame, stamp: TimeMessage) -> None:
+    def publish_frame(self, frame: Frame, stamp: TimeMessage) -> None:
         """Keep the frame of the pose with that stamp, and send its picture if wanted.
 
         Raises:
@@ -161,12 +161,12 @@ class AnnotatedImage:
         node.health.values["probe_pose"] = state
         missing = state in ("stale", "lost")
         warning = f"the probe's pose is {state}: the image is frozen" if missing else ""
-        if missing and (why := poses_ended(node)):
+        if missing and (why := explain_missing_poses(node)):
             warning = f"{why}: the image is frozen"
             if not self._missing:
                 node.get_logger().info(f"{warning} until somebody does")
         elif missing and not self._missing:
-            node.health.problem(
+            node.health.count_problem(
                 "pose age",
                 f"the newest probe pose is {self._pose_age.seconds:.1f} s old: the image is "
                 f"frozen; look at the tracker",
@@ -203,19 +203,19 @@ class AnnotatedImage:
         if self._annotation.is_flipped != shown.flip:
             self._annotation = Annotation(self._probe, self._structures, is_flipped=shown.flip)
         lines = [line for each in self._streams if each.is_wanted for line in each.lines()]
-        refine = None if frame is None else partial(onto_border, frame)
-        picture = self._annotation.draw(image, labels, badge, overlay, lines, refine)
+        refine = None if frame is None else partial(snap_to_border, frame)
+        picture = self._annotation.draw_annotated(image, labels, badge, overlay, lines, refine)
         if shown.beside:
             plain = image[:, ::-1] if shown.flip else image
             picture = np.hstack([np.repeat(plain[:, :, None], 3, axis=2), picture])
         self._publisher.publish(image_message(picture, self._stamp, "probe"))
-        self._node.health.published(_TOPIC)
+        self._node.health.count_published(_TOPIC)
 
     def _labels(self, frame: Frame) -> NDArray[np.uint8] | None:
         try:
             return frame.labels if self._structures else None
         except UsSimError as error:
-            self._node.health.problem("labels", f"{error}; nothing is outlined")
+            self._node.health.count_problem("labels", f"{error}; nothing is outlined")
             return None
 
     def _overlay(self, frame: Frame) -> Overlay | None:
@@ -223,7 +223,9 @@ class AnnotatedImage:
         try:
             return stream.overlay(frame) if stream else None
         except UsSimError as error:
-            self._node.health.problem("overlay", f"{error}; no colours are laid over the image")
+            self._node.health.count_problem(
+                "overlay", f"{error}; no colours are laid over the image"
+            )
             return None
 
     def _require_overlay(self, wanted: Mapping[str, AnnotatedImageSettings]) -> None:

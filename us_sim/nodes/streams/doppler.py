@@ -11,11 +11,11 @@ from rclpy.parameter import Parameter
 
 from us_sim.nodes.parameters import LiveSettings
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.nodes.streams.stream import Adjustable, FrameStream
-from us_sim.scene.building import blood_of
+from us_sim.nodes.streams.stream import AdjustableImager, FrameStream
+from us_sim.scene.building import build_blood
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.flow.blood import Blood
-from us_sim.slicing.flow.doppler import ColourDoppler, Spectrum, nearest_vessel, warm_up
+from us_sim.slicing.flow.doppler import ColourDoppler, Spectrum, find_nearest_vessel, warm_up
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.settings import DopplerSettings
 from us_sim.volume.volume import Volume
@@ -24,14 +24,14 @@ EVERY_S = 0.2  # between two searches for the vessel; of the frames' time
 _OPACITY = 0.9
 
 
-def doppler_streams(node: SceneNode, volume: Volume) -> list[FrameStream]:
+def create_doppler_streams(node: SceneNode, volume: Volume) -> list[FrameStream]:
     """The velocity of blood, its colour Doppler and its spectrum; flows are parameters of the node.
 
     Raises:
         SceneError: a structure with a flow is no tube, or its flow leads across it.
     """
     warm_up()
-    blood = blood_of(node.scene, volume)
+    blood = build_blood(node.scene, volume)
     vessels = {
         f"flow.{name}.": vessel
         for name, vessel in zip(node.scene.flows, blood.vessels, strict=True)
@@ -39,19 +39,19 @@ def doppler_streams(node: SceneNode, volume: Volume) -> list[FrameStream]:
 
     def require(wanted: dict[str, Any]) -> None:
         for name, settings in wanted.items():
-            vessels[name].require(settings)
+            vessels[name].find_flow_sign(settings)
 
     def use(wanted: dict[str, Any]) -> None:
         for name, settings in wanted.items():
             if settings != vessels[name].settings:
-                vessels[name].use(settings)
+                vessels[name].apply_settings(settings)
 
     given = {f"flow.{name}.": flow for name, flow in node.scene.flows.items()}
     use(LiveSettings(node, given, require, use).values)
     return [*_colour_streams(node, blood), _spectrum_stream(node, blood)]
 
 
-class Following:
+class VesselFollower:
     """Keeps ``PREFIX.lateral`` and ``PREFIX.depth`` on a vessel where ``PREFIX.follow`` is set.
 
     Args:
@@ -70,7 +70,7 @@ class Following:
             return
         self._updated = frame.time
         depth = 0.5 * frame.probe.depth if settings.depth is None else settings.depth
-        place = nearest_vessel(self._blood, frame, settings.lateral, depth, steering)
+        place = find_nearest_vessel(self._blood, frame, settings.lateral, depth, steering)
         if place is None:
             return
         for name, value in zip(("lateral", "depth"), place, strict=True):
@@ -79,15 +79,15 @@ class Following:
 
 def _colour_streams(node: SceneNode, blood: Blood) -> list[FrameStream]:
     """Return ``ultrasound/velocity``, exact along the beams, and its estimate, by ``colour.…``."""
-    colour = Adjustable(node, ColourDoppler, node.scene.colour, "colour.")
-    following = Following(node, "colour.", blood)
+    colour = AdjustableImager(node, ColourDoppler, node.scene.colour, "colour.")
+    following = VesselFollower(node, "colour.", blood)
 
     @lru_cache(maxsize=1)  # frames before it count, too
     def estimate(frame: Frame) -> NDArray[np.float32]:
         doppler = colour.for_frame(frame)
         following.update(frame, doppler.settings, 0.0)
-        shown = doppler.estimate(blood, frame)
-        node.health.values["no_colour"] = doppler.absence(blood, frame, shown).value
+        shown = doppler.estimate_velocity(blood, frame)
+        node.health.values["no_colour"] = doppler.explain_absence(blood, frame, shown).value
         return shown
 
     def overlay(frame: Frame) -> Overlay:
@@ -96,11 +96,13 @@ def _colour_streams(node: SceneNode, blood: Blood) -> list[FrameStream]:
 
     return [
         FrameStream(
-            node, "ultrasound/velocity", lambda frame: colour.for_frame(frame).truth(blood, frame)
+            node,
+            "ultrasound/velocity",
+            lambda frame: colour.for_frame(frame).compute_true_velocity(blood, frame),
         ),
         FrameStream(
             *(node, "ultrasound/velocity_estimate", estimate),
-            prepare=colour.prepare,
+            prepare=colour.prepare_for_probe,
             overlay=overlay,
         ),
     ]
@@ -108,18 +110,20 @@ def _colour_streams(node: SceneNode, blood: Blood) -> list[FrameStream]:
 
 def _spectrum_stream(node: SceneNode, blood: Blood) -> FrameStream:
     """Return ``ultrasound/spectrum``: velocities at the gate over time, by ``spectrum.…``."""
-    spectra = Adjustable(node, Spectrum, node.scene.spectrum, "spectrum.", Spectrum.go_on)
-    following = Following(node, "spectrum.", blood)
+    spectra = AdjustableImager(
+        node, Spectrum, node.scene.spectrum, "spectrum.", Spectrum.take_over_picture
+    )
+    following = VesselFollower(node, "spectrum.", blood)
 
     def draw(frame: Frame) -> NDArray[np.uint8]:
         spectrum = spectra.for_frame(frame)
         following.update(frame, spectrum.settings, spectrum.settings.steering)
-        picture = spectrum.show(blood, frame)
-        node.health.values["no_spectrum"] = spectrum.absence(blood, frame).value
+        picture = spectrum.draw_sweep(blood, frame)
+        node.health.values["no_spectrum"] = spectrum.explain_absence(blood, frame).value
         return picture
 
     return FrameStream(
         *(node, "ultrasound/spectrum", draw),
-        prepare=spectra.prepare,
+        prepare=spectra.prepare_for_probe,
         lines=lambda: spectra.made.lines if spectra.made else [],  # gate's ends, and the angle
     )

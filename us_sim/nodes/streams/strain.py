@@ -15,10 +15,10 @@ from us_sim.nodes.streams.stream import FrameStream
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
-from us_sim.slicing.settings import Strain
-from us_sim.slicing.strain import AxialStrain, FollowingEnd, compression, strain_scale
+from us_sim.slicing.settings import StrainSettings
+from us_sim.slicing.strain import AdaptiveScale, AxialStrain, make_strain_scale, measure_compression
 from us_sim.slicing.strain_estimate import (
-    Earlier,
+    FrameHistory,
     estimate_strain,
     require_short_windows,
     warm_up,
@@ -27,11 +27,11 @@ from us_sim.slicing.strain_estimate import (
 Values = NDArray[np.float32]
 
 
-def strain_streams(node: SceneNode) -> list[FrameStream]:
+def create_strain_streams(node: SceneNode) -> list[FrameStream]:
     """Return both, by the scene's settings as parameters ``strain.…``."""
     probes: list[Probe] = []  # that images come of
 
-    def check(wanted: dict[str, Strain]) -> None:
+    def check(wanted: dict[str, StrainSettings]) -> None:
         for probe in probes:
             require_short_windows(probe, wanted["strain."])
 
@@ -47,7 +47,7 @@ def _strain_stream(
     node: SceneNode,
     topic: str,
     live: LiveSettings,
-    make: Callable[[Frame, Strain], Values | None],
+    make: Callable[[Frame, StrainSettings], Values | None],
     note: Callable[[Values], str],
     prepare: Callable[[Probe], None],
 ) -> FrameStream:
@@ -59,7 +59,7 @@ def _strain_stream(
         make: returns the strain of a frame; None where there is nothing to compare it with.
         note: returns a line about it.
     """
-    end = FollowingEnd()
+    end = AdaptiveScale()
     make_once = lru_cache(maxsize=1)(make)
 
     def draw(frame: Frame) -> Values | None:
@@ -69,28 +69,28 @@ def _strain_stream(
         values = draw(frame)
         if values is None:
             return None
-        most = live.values["strain."].colours or end.of(values)
-        return Overlay(values, strain_scale(topic.rpartition("/")[2], most), note=note(values))
+        most = live.values["strain."].colours or end.update_end(values)
+        return Overlay(values, make_strain_scale(topic.rpartition("/")[2], most), note=note(values))
 
     return FrameStream(node, topic, draw, prepare=prepare, overlay=overlay)
 
 
 def _tissue_strain(node: SceneNode, live: LiveSettings) -> FrameStream:
     """Return ``ultrasound/strain``: of the tissue itself, since rest or since an image before."""
-    earlier = Earlier(lambda frame: frame.nodes)
+    earlier = FrameHistory(lambda frame: frame.nodes)
     made: tuple[object, AxialStrain] | None = None  # the last mesh, and its strain
 
-    def make(frame: Frame, settings: Strain) -> Values | None:
+    def make(frame: Frame, settings: StrainSettings) -> Values | None:
         nonlocal made
-        before = earlier.before(frame, settings.interval)
+        before = earlier.get_before(frame, settings.interval)
         if settings.since == "image" and before is None:
             return None
         if made is None or made[0] is not frame.mesh:
-            made = frame.mesh, AxialStrain.of(frame)
-        return made[1].image(frame, before if settings.since == "image" else None)
+            made = frame.mesh, AxialStrain.from_frame(frame)
+        return made[1].compute_strain(frame, before if settings.since == "image" else None)
 
     def note(values: Values) -> str:
-        pressed = compression(values)
+        pressed = measure_compression(values)
         mean, quality = f"{100 * pressed.mean:.2g} %", f"{pressed.quality:.2f}"
         node.health.values |= {"strain_mean": mean, "compression_quality": quality}
         return f"mean {mean}, quality {quality}"
@@ -102,23 +102,23 @@ def _strain_estimate(
     node: SceneNode, live: LiveSettings, prepare: Callable[[Probe], None]
 ) -> FrameStream:
     """Return ``ultrasound/strain_estimate``: between two images, from their grey values alone."""
-    earlier, correlation = Earlier(lambda frame: frame.pixels), 0.0
+    earlier, correlation = FrameHistory(lambda frame: frame.pixels), 0.0
 
-    def make(frame: Frame, settings: Strain) -> Values | None:
+    def make(frame: Frame, settings: StrainSettings) -> Values | None:
         nonlocal correlation
-        before = earlier.before(frame, settings.interval)
+        before = earlier.get_before(frame, settings.interval)
         if before is None:
             return None
         try:
             found = estimate_strain(before, frame.pixels, frame.probe, settings)
         except ProbeError as error:
-            node.health.problem("strain estimate", f"{error}; no strain is estimated")
+            node.health.count_problem("strain estimate", f"{error}; no strain is estimated")
             return None
         correlation = found.correlation
         return found.strain
 
     def note(values: Values) -> str:
-        mean, match = f"{100 * compression(values).mean:.2g} %", f"{correlation:.2f}"
+        mean, match = f"{100 * measure_compression(values).mean:.2g} %", f"{correlation:.2f}"
         node.health.values |= {"strain_estimate_mean": mean, "strain_correlation": match}
         return f"mean {mean}, correlation {match}"
 

@@ -51,25 +51,25 @@ class FrameStream:
     ) -> None:
         self.topic, self.prepare, self.overlay, self.lines = topic, prepare, overlay, lines
         self._node, self._draw = node, draw
-        self._publisher = node.stream(Image, topic)
+        self._publisher = node.create_stream_publisher(Image, topic)
 
     @property
     def is_wanted(self) -> bool:
         """Whether somebody subscribes."""
         return bool(self._publisher.get_subscription_count() > 0)
 
-    def show(self, frame: Frame, stamp: Time) -> None:
+    def publish_frame(self, frame: Frame, stamp: Time) -> None:
         """Send the image made of the frame, under the stamp of its pose."""
         pixels = self._draw(frame)
         if pixels is not None:
             self._publisher.publish(image_message(pixels, stamp, "probe"))
-            self._node.health.published(self.topic, stamp if self.topic == IMAGE else None)
+            self._node.health.count_published(self.topic, stamp if self.topic == IMAGE else None)
 
 
 M = TypeVar("M")
 
 
-class Adjustable(Generic[M]):
+class AdjustableImager(Generic[M]):
     """What makes the images of a topic: an object for one probe and one state of its parameters.
 
     Args:
@@ -94,7 +94,7 @@ class Adjustable(Generic[M]):
         self._prefix = prefix
         self._settings = LiveSettings(node, {prefix: settings}, self._require)
 
-    def prepare(self, probe: Probe) -> None:
+    def prepare_for_probe(self, probe: Probe) -> None:
         """Check whether it can be made for this probe; the one in use stays.
 
         Raises:
@@ -120,12 +120,12 @@ class Adjustable(Generic[M]):
             self._make(self._made_for[0], wanted[self._prefix])
 
 
-def m_mode_stream(node: SceneNode) -> FrameStream:
+def create_m_mode_stream(node: SceneNode) -> FrameStream:
     """Return ``ultrasound/m_mode``: the image along a line over time, by ``m_mode.…``."""
-    m_mode = Adjustable(node, MMode, node.scene.m_mode, "m_mode.", MMode.go_on)
+    m_mode = AdjustableImager(node, MMode, node.scene.m_mode, "m_mode.", MMode.take_over_picture)
     return FrameStream(
         *(node, "ultrasound/m_mode"),
-        lambda frame: m_mode.for_frame(frame).show(frame.pixels, frame.time),
-        prepare=m_mode.prepare,
+        lambda frame: m_mode.for_frame(frame).draw_sweep(frame.pixels, frame.time),
+        prepare=m_mode.prepare_for_probe,
         lines=lambda: [m_mode.made.places] if m_mode.made else [],
     )

@@ -12,17 +12,17 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
 
 from us_sim.nodes.qos import FOREIGN
-from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
-from us_sim.scene.building import camera_body_of
+from us_sim.nodes.tracker_inputs.device import TrackerInput, TrackerNode
+from us_sim.scene.building import load_camera_body
 from us_sim.tracking.camera.encodings import decode_image, decompress_image
 from us_sim.tracking.camera.model import CameraModel
-from us_sim.tracking.camera.source import CameraSource, practice
+from us_sim.tracking.camera.source import CameraSource, practise_tracking
 from us_sim.tracking.settings import CameraSettings
 
 Decoder = Callable[[Any, str], NDArray[np.uint8]]
 
 
-def camera_from(message: CameraInfo) -> CameraModel:
+def camera_model_from(message: CameraInfo) -> CameraModel:
     """The camera that a driver describes.
 
     Raises:
@@ -40,10 +40,10 @@ def camera_from(message: CameraInfo) -> CameraModel:
 class CameraInput(TrackerInput):
     """``camera/image_raw``, or ``camera/image_raw/compressed``, with ``camera/camera_info``."""
 
-    def __init__(self, device: Device, settings: CameraSettings) -> None:
+    def __init__(self, device: TrackerNode, settings: CameraSettings) -> None:
         super().__init__(device, settings)
-        self._body = camera_body_of(device.scene)
-        practice(self._body)
+        self._body = load_camera_body(device.scene)
+        practise_tracking(self._body)
         self._source: CameraSource | None = None
         self._described: CameraInfo | None = None
         device.subscribe(
@@ -65,22 +65,22 @@ class CameraInput(TrackerInput):
         message.header = Header()  # that of each image is another one
         if message != self._described:
             self._described, self._source = message, None
-            self._source = CameraSource(camera_from(message), self._body, self._settings)
+            self._source = CameraSource(camera_model_from(message), self._body, self._settings)
 
     def _on_image(self, topic: str, decode: Decoder, message: Image | CompressedImage) -> None:
         if self._source is None:
             if self._described is None:
-                self._device.refuse(
+                self._device.refuse_measurement(
                     "camera",
                     "no camera/camera_info has come, so no pose can be measured: calibrate the "
                     "camera (us-sim calibrate camera) and give its driver the file",
                 )
             return
         stamp = self._device.stamp_of(message.header, topic)
-        measurement = self._source.measure(decode(message, "GRAY"), stamp)
+        measurement = self._source.measure_pose(decode(message, "GRAY"), stamp)
         if measurement is None:
-            self._device.refuse("markers", f"{topic}: {self._source.last_problem}")
+            self._device.refuse_measurement("markers", f"{topic}: {self._source.last_problem}")
             return
         left_out = self._source.last_problem
         self._device.health.values["markers"] = left_out or "all that are seen are used"
-        self._device.take(measurement)
+        self._device.take_measurement(measurement)

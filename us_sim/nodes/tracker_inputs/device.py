@@ -11,7 +11,7 @@ from std_msgs.msg import Header
 
 from us_sim.errors import FrameError, UsSimError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.guarded_node import kind_of
+from us_sim.nodes.guarded_node import error_kind
 from us_sim.nodes.process import MEASURING
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.recording.decoding import nanoseconds_of, pose_from
@@ -21,7 +21,7 @@ from us_sim.tracking.probe_tracking import ProbeTracking
 
 
 class TrackerInput:
-    """Hands the measurements of one kind of source to the tracker, with `Device.take`.
+    """Hands the measurements of one kind of source to the tracker, with `Device.take_measurement`.
 
     A source of poses is a subclass of this, registered in `us_sim.settings.registry.TRACKERS` or,
     by another package, under the entry point group ``us_sim.trackers``.
@@ -34,7 +34,7 @@ class TrackerInput:
     Settings: ClassVar[type[Settings]] = Settings
     """Settings of this source in a scene, under its own name in ``tracker``."""
 
-    def __init__(self, device: Device, settings: Any) -> None:
+    def __init__(self, device: TrackerNode, settings: Any) -> None:
         self._device = device
         self._settings = settings
 
@@ -45,7 +45,7 @@ class TrackerInput:
         """Let go of the device, where it is held by more than subscriptions."""
 
 
-class Device(SceneNode):
+class TrackerNode(SceneNode):
     """The tracker as its input uses it: a node, and where measurements go."""
 
     live_priority = MEASURING
@@ -54,26 +54,28 @@ class Device(SceneNode):
     _tracking: ProbeTracking
 
     @abstractmethod
-    def take(self, measurement: Measurement) -> None:
+    def take_measurement(self, measurement: Measurement) -> None:
         """Publish the probe's pose, if the measurement can be believed."""
 
-    def refuse(self, kind: str, sentence: str) -> None:
+    def refuse_measurement(self, kind: str, sentence: str) -> None:
         """Count and say, now and then, why a measurement is not used."""
-        self._tracking.refuse(kind, sentence)
-        self.health.problem(kind, sentence)
+        self._tracking.count_refusal(kind, sentence)
+        self.health.count_problem(kind, sentence)
 
-    def refused(self, where: str, error: UsSimError) -> None:
+    def report_bad_input(self, where: str, error: UsSimError) -> None:
         """Count and report bad input, in the probe's status too."""
-        self._tracking.refuse(kind_of(error), str(error))
-        super().refused(where, error)
+        self._tracking.count_refusal(error_kind(error), str(error))
+        super().report_bad_input(where, error)
 
-    def failed(self, where: str, error: Exception) -> None:
+    def report_failure(self, where: str, error: Exception) -> None:
         """Begin anew, too, since the failed state may be of no use."""
-        super().failed(where, error)
+        super().report_failure(where, error)
         self._input.reset()
         self._tracking.reset()
 
-    def measured(self, message: PoseStamped, topic: str, frame: str = "") -> tuple[int, Pose]:
+    def read_measurement(
+        self, message: PoseStamped, topic: str, frame: str = ""
+    ) -> tuple[int, Pose]:
         """Return when a pose was measured, ns, and the pose.
 
         Args:
@@ -96,7 +98,7 @@ class Device(SceneNode):
         q = message.pose.orientation
         length = math.hypot(q.x, q.y, q.z, q.w)
         if abs(length - 1.0) > 1e-2:  # more than rounding
-            self.health.problem(
+            self.health.count_problem(
                 "quaternion", f"{topic}: the quaternion's length is {length:.4g}, taken as 1"
             )
         return self.stamp_of(message.header, topic), pose
@@ -109,10 +111,10 @@ class Device(SceneNode):
         """
         stamp = nanoseconds_of(header.stamp)
         if stamp == 0:
-            self.health.problem("stamp", f"{topic} has no stamp: its time of arrival is used")
-            stamp = self.now()
+            self.health.count_problem("stamp", f"{topic} has no stamp: its time of arrival is used")
+            stamp = self.read_clock()
         return stamp
 
-    def now(self) -> int:
+    def read_clock(self) -> int:
         """Return the present, ns."""
         return int(self.get_clock().now().nanoseconds)

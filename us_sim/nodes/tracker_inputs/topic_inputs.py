@@ -15,9 +15,9 @@ from us_sim.geometry.frame_chain import FrameChain
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.tf import TFMessage
-from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
+from us_sim.nodes.tracker_inputs.device import TrackerInput, TrackerNode
 from us_sim.recording.decoding import transform_from
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import format_count
 from us_sim.tracking.haptic import HapticDevice
 from us_sim.tracking.measurement import PATIENT, Measurement
 from us_sim.tracking.mouse import SixDofMouse
@@ -31,7 +31,7 @@ class PoseInput(TrackerInput):
     where the patient is needs neither registration nor calibration.
     """
 
-    def __init__(self, device: Device, settings: Any) -> None:
+    def __init__(self, device: TrackerNode, settings: Any) -> None:
         super().__init__(device, settings)
         self._frame = device.scene.tracker.frame
         device.subscribe(PoseStamped, "tracker/pose", self.on_pose, FOREIGN)
@@ -40,52 +40,54 @@ class PoseInput(TrackerInput):
         """Hand on the measurement in a message."""
         of_probe = message.header.frame_id == PATIENT != self._frame
         frame = PATIENT if of_probe else self._frame
-        stamp, pose = self._device.measured(message, "tracker/pose", frame)
-        self._device.take(Measurement(stamp, pose, of_probe=of_probe))
+        stamp, pose = self._device.read_measurement(message, "tracker/pose", frame)
+        self._device.take_measurement(Measurement(stamp, pose, of_probe=of_probe))
 
 
 class PoseArrayInput(TrackerInput):
     """The pose ``tracker.entry`` of ``tracker/poses``, in the frame that the scene names."""
 
-    def __init__(self, device: Device, settings: Any) -> None:
+    def __init__(self, device: TrackerNode, settings: Any) -> None:
         super().__init__(device, settings)
         self._entry = device.scene.tracker.entry
         device.subscribe(PoseArray, "tracker/poses", self._on_poses, FOREIGN)
 
     def _on_poses(self, message: PoseArray) -> None:
         if self._entry >= len(message.poses):
-            self._device.refuse(
+            self._device.refuse_measurement(
                 "entry",
-                f"tracker/poses holds {counted(len(message.poses), 'pose')}, so none is "
+                f"tracker/poses holds {format_count(len(message.poses), 'pose')}, so none is "
                 f"number {self._entry} (from 0): set tracker.entry in the scene",
             )
             return
         entry = PoseStamped(header=message.header, pose=message.poses[self._entry])
-        self._device.take(Measurement(*self._device.measured(entry, "tracker/poses")))
+        self._device.take_measurement(
+            Measurement(*self._device.read_measurement(entry, "tracker/poses"))
+        )
 
 
 class HapticInput(TrackerInput):
     """``haptic/pose`` in the frame that the scene names; ``haptic/clutch`` holds the probe."""
 
-    def __init__(self, device: Device, settings: HapticSettings) -> None:
+    def __init__(self, device: TrackerNode, settings: HapticSettings) -> None:
         super().__init__(device, settings)
         self._handle = HapticDevice(settings)
         device.subscribe(PoseStamped, "haptic/pose", self._on_pose, FOREIGN)
-        device.subscribe(Bool, "haptic/clutch", lambda m: self._handle.clutch(m.data), FOREIGN)
+        device.subscribe(Bool, "haptic/clutch", lambda m: self._handle.set_clutch(m.data), FOREIGN)
 
     def reset(self) -> None:
         """Forget the clutch."""
         self._handle.reset()
 
     def _on_pose(self, message: PoseStamped) -> None:
-        stamp, pose = self._device.measured(message, "haptic/pose")
-        self._device.take(self._handle.take(pose, stamp))
+        stamp, pose = self._device.read_measurement(message, "haptic/pose")
+        self._device.take_measurement(self._handle.measure_body(pose, stamp))
 
 
 class SixDofMouseInput(TrackerInput):
     """``spacenav/joy``, or ``spacenav/twist`` where there is no joystick message."""
 
-    def __init__(self, device: Device, settings: SixDofMouseSettings) -> None:
+    def __init__(self, device: TrackerNode, settings: SixDofMouseSettings) -> None:
         super().__init__(device, settings)
         self._mouse = SixDofMouse(settings)
         self._has_joy = False
@@ -99,7 +101,7 @@ class SixDofMouseInput(TrackerInput):
     def _on_joy(self, message: Joy) -> None:
         self._has_joy = True
         stamp = self._device.stamp_of(message.header, "spacenav/joy")
-        self._take(list(message.axes), list(message.buttons), stamp, "spacenav/joy")
+        self._take_deflections(list(message.axes), list(message.buttons), stamp, "spacenav/joy")
 
     def _on_twist(self, message: Twist) -> None:
         """The same deflections without buttons; a driver that sends both is heard once."""
@@ -107,14 +109,16 @@ class SixDofMouseInput(TrackerInput):
             return
         v, w = message.linear, message.angular
         axes = [v.x, v.y, v.z, w.x, w.y, w.z]
-        self._take(axes, [], self._device.now(), "spacenav/twist")
+        self._take_deflections(axes, [], self._device.read_clock(), "spacenav/twist")
 
-    def _take(self, axes: list[float], buttons: list[int], stamp: int, topic: str) -> None:
-        measurement = self._mouse.axes(axes, buttons, stamp)
+    def _take_deflections(
+        self, axes: list[float], buttons: list[int], stamp: int, topic: str
+    ) -> None:
+        measurement = self._mouse.move_probe(axes, buttons, stamp)
         if measurement is not None:
-            self._device.take(measurement)
+            self._device.take_measurement(measurement)
         elif self._mouse.last_problem:
-            self._device.refuse("axes", f"{topic}: {self._mouse.last_problem}")
+            self._device.refuse_measurement("axes", f"{topic}: {self._mouse.last_problem}")
 
 
 MOVING = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -132,7 +136,7 @@ class TfInput(TrackerInput):
     Its stamp is the latest at which every frame between is known, see `FrameChain`.
     """
 
-    def __init__(self, device: Device, settings: Any) -> None:
+    def __init__(self, device: TrackerNode, settings: Any) -> None:
         super().__init__(device, settings)
         if TFMessage is None:
             raise TrackingError(
@@ -156,14 +160,14 @@ class TfInput(TrackerInput):
 
     def reset(self) -> None:
         """Forget what moved; what is fixed is told once."""
-        self._chain.restart()
+        self._chain.forget_motion()
 
     def _on_static(self, message: TFMessage) -> None:
         """Keep static transforms; a chain of these alone makes no poses."""
         for child, parent, pose, _ in self._transforms(message):
-            self._chain.fix(child, parent, pose)
+            self._chain.set_fixed_link(child, parent, pose)
         if self._chain.is_fixed:
-            self._device.refuse(
+            self._device.refuse_measurement(
                 "frame",
                 f"nothing moves in tf between '{self._frame}' and '{self._body}': all of it is in "
                 f"tf_static, so no pose comes",
@@ -177,24 +181,26 @@ class TfInput(TrackerInput):
             try:
                 yield child, parent, transform_from(transform), transform.header
             except PoseError as error:
-                self._device.refuse("pose", f"tf from {parent} to {child}: {error}; it is not used")
+                self._device.refuse_measurement(
+                    "pose", f"tf from {parent} to {child}: {error}; it is not used"
+                )
 
     def _on_tf(self, message: TFMessage) -> None:
         for child, parent, pose, header in self._transforms(message):
             stamp = self._device.stamp_of(header, "tf")
-            made = self._chain.move(child, parent, stamp, pose)
+            made = self._chain.update_link(child, parent, stamp, pose)
             if made is not None:
-                self._device.take(Measurement(*made))
-        if self._chain.links() is None:
-            self._device.refuse(
+                self._device.take_measurement(Measurement(*made))
+        if self._chain.find_links() is None:
+            self._device.refuse_measurement(
                 "frame",
                 f"tf has no way from '{self._body}' up to '{self._frame}' yet: see tracker.body "
                 f"and tracker.frame in the scene",
             )
             return
-        link, lag = self._chain.lag()
+        link, lag = self._chain.find_slowest_link()
         if lag > STALE_S:
-            self._device.refuse(
+            self._device.refuse_measurement(
                 "time",
                 f"the newest transform of '{link}' in tf is {lag:.1f} s older than others on the "
                 f"way to '{self._frame}', and a pose needs all at one time: publish it as often as "

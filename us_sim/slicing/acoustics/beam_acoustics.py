@@ -16,17 +16,17 @@ from us_sim.kernels import njit
 from us_sim.slicing.acoustics.media import (
     LOCATED,
     BeamGrid,
-    decibels_per_metre,
-    media_of,
-    surface_levels,
+    build_media,
+    compute_surface_levels,
+    convert_attenuation,
 )
 from us_sim.slicing.acoustics.path_loss import (
     AMPLITUDES,
+    allocate_crossings,
     cast_shadows,
-    follow_beams,
-    room_for_crossings,
     sharpen_borders,
     sharpen_edges,
+    trace_beams,
 )
 from us_sim.slicing.acoustics.settings import Acoustics
 from us_sim.slicing.acoustics.surface_echo import (
@@ -34,9 +34,14 @@ from us_sim.slicing.acoustics.surface_echo import (
     GRAIN,
     SurfaceNormals,
     draw_surfaces,
-    surface_normals_of,
+    find_surface_normals,
 )
-from us_sim.slicing.cutting.resampling import Located, full_runs, label_voxels, pixel_to_index
+from us_sim.slicing.cutting.resampling import (
+    LocatedPixels,
+    compute_pixel_to_index,
+    get_label_voxels,
+    make_full_runs,
+)
 from us_sim.slicing.formation.image_formation import GREYS_PER_DECIBEL
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.plane import SlicePlane
@@ -60,17 +65,19 @@ class BeamAcoustics:
     def __init__(self, volume: Volume, probe: Probe, acoustics: Acoustics) -> None:
         self._volume, self._acoustics = volume, acoustics
         if volume.labels is None:
-            raise acoustics.refused(
+            raise acoustics.make_error(
                 "artefacts",
                 "`live` needs to know what is where, and the volume has no labels: say `baked`, or "
                 "give a volume with a segmentation",
             )
-        self._voxels, self._shape = label_voxels(volume)
+        self._voxels, self._shape = get_label_voxels(volume)
         self.grid = grid = BeamGrid(probe)
         self._probe = probe
-        frequency = acoustics.frequency_among(probe.frequencies)
-        self._media, self._constants, directions = media_of(volume, acoustics, frequency, grid.step)
-        rise = decibels_per_metre(acoustics.compensation, frequency)
+        frequency = acoustics.choose_frequency(probe.frequencies)
+        self._media, self._constants, directions = build_media(
+            volume, acoustics, frequency, grid.step
+        )
+        rise = convert_attenuation(acoustics.compensation, frequency)
         if not acoustics.attenuation:
             rise = 0.0
         self._time_gain = (rise * grid.distance).astype(np.float32)
@@ -81,8 +88,8 @@ class BeamAcoustics:
         self._pulse = _PULSE * SPEED_OF_SOUND / frequency
         self._noise = None
         if acoustics.noise is not None:
-            self._noise = Noise(probe, acoustics.noise, rise)
-        self._surface = surface_levels(self._constants)
+            self._noise = ElectronicNoise(probe, acoustics.noise, rise)
+        self._surface = compute_surface_levels(self._constants)
         self._rest_index = np.empty((0, 3))
         self._corners = np.empty((0, 4), dtype=np.int32)
         self._gain = _apart((grid.samples, grid.beams), np.float32)
@@ -92,27 +99,27 @@ class BeamAcoustics:
         places = grid.places.astype(np.int64)
         places = places // columns * self._elements.shape[1] + places % columns
         self._places = np.ascontiguousarray(places, dtype=np.int32)
-        self._crossings = room_for_crossings(_CROSSINGS * grid.beams)
+        self._crossings = allocate_crossings(_CROSSINGS * grid.beams)
         self._across, self._along = (
             np.ascontiguousarray(grid.directions[:, axis], dtype=np.float32) for axis in (0, 1)
         )
         self._found = 0
-        self._at: tuple[Located, NDArray[np.float64]]
+        self._at: tuple[LocatedPixels, NDArray[np.float64]]
         self._lines = grid.lines
         self._dither = _dither(probe.columns)
         self._rigid = np.ascontiguousarray(volume.patient_to_index[:3, :3])
         self._origin = -probe.image_to_probe[[0, 2], 3] / probe.pixel_spacing
-        plane = probe.plane(Pose())
-        self._runs = full_runs(plane) if plane.spans is None else plane.spans
+        plane = probe.make_plane(Pose())
+        self._runs = make_full_runs(plane) if plane.spans is None else plane.spans
 
-    def resolved(self, imaging: Imaging) -> Imaging:
+    def resolve_imaging(self, imaging: Imaging) -> Imaging:
         """The console's settings with the blur of a frequency below the volume's own.
 
         A point is as long as 1.5 wavelengths and as wide as a wavelength times the f-number, 2
         (Szabo 2014, section 6.6). The blur of the volume's own frequency is taken off in squares.
         """
         own = self._acoustics.volume_frequency
-        frequency = self._acoustics.frequency_among(self._probe.frequencies)
+        frequency = self._acoustics.choose_frequency(self._probe.frequencies)
         if own is None or frequency >= own:
             return imaging
         wavelength = SPEED_OF_SOUND * math.sqrt(1.0 / frequency**2 - 1.0 / own**2)
@@ -125,17 +132,17 @@ class BeamAcoustics:
     def warm_up(self) -> None:
         """Load every kernel, and find the volume's surfaces."""
         blank = np.zeros((self._probe.rows, self._probe.columns), dtype=np.uint8)
-        self.heard(blank, Frame(Pose(), None, self._probe, self._volume))
+        self.apply_acoustics(blank, Frame(Pose(), None, self._probe, self._volume))
 
-    def carry(self, rest_nodes: NDArray[np.float64], corners: NDArray[np.int32]) -> None:
+    def attach_mesh(self, rest_nodes: NDArray[np.float64], corners: NDArray[np.int32]) -> None:
         """Let a mesh carry the volume: (N, 3) m at rest and (M, 4)."""
         to_index = self._volume.patient_to_index
         self._rest_index = rest_nodes @ to_index[:3, :3].T + to_index[:3, 3]
         self._corners = np.ascontiguousarray(corners, dtype=np.int32)
         if self._fibres is not None:
-            self._fibres.carry(rest_nodes, self._corners)
+            self._fibres.attach_mesh(rest_nodes, self._corners)
 
-    def gain(self, frame: Frame) -> NDArray[np.float32]:
+    def compute_gain(self, frame: Frame) -> NDArray[np.float32]:
         """(samples, beams) dB to add to the volume's echoes: time gain less all that is lost.
 
         It is overwritten by the next one.
@@ -144,8 +151,8 @@ class BeamAcoustics:
         self._at = located, nodes = self._located(frame)
         self._elements[:, : located.elements.shape[1]] = located.elements
         if self._fibres is not None:
-            fibre = self._fibres.now(located, nodes, frame.plane)
-        self._found, first = follow_beams(
+            fibre = self._fibres.compute_directions(located, nodes, frame.plane)
+        self._found, first = trace_beams(
             self._elements.reshape(-1), self._elements.shape[1], self._steps, located.maps,
             self._voxels, self._shape, self._places, self._lines, self._across, self._along,
             self._media, self._time_gain, fibre,
@@ -162,20 +169,20 @@ class BeamAcoustics:
         )  # fmt: skip
         return self._gain[:, : grid.beams]
 
-    def heard(self, image: NDArray[np.uint8], frame: Frame) -> NDArray[np.uint8]:
+    def apply_acoustics(self, image: NDArray[np.uint8], frame: Frame) -> NDArray[np.uint8]:
         """A slice of echoes (rows, columns) as the frame's beams bring them."""
-        gain = self.gain_on_pixels(frame)
+        gain = self.compute_pixel_gain(frame)
         out = np.empty_like(image)
         _add_gain(image, gain, np.float32(GREYS_PER_DECIBEL), self._dither, out)
         if self._acoustics.surfaces:
             self._draw(frame, out)
         if self._noise is not None:
-            np.maximum(out, self._noise.at(frame.pose), out=out)
+            np.maximum(out, self._noise.make_noise(frame.pose), out=out)
         return out
 
-    def gain_on_pixels(self, frame: Frame) -> NDArray[np.float32]:
+    def compute_pixel_gain(self, frame: Frame) -> NDArray[np.float32]:
         """(rows, columns) dB to add to the volume's echoes."""
-        gain = self.grid.on_pixels(self.gain(frame))
+        gain = self.grid.interpolate_to_pixels(self.compute_gain(frame))
         if self.grid.is_linear:
             sharpen_borders(
                 self._found, self._crossings, self._gain, self._blocked, self._media, self._rise,
@@ -183,18 +190,18 @@ class BeamAcoustics:
             )  # fmt: skip
         return gain
 
-    def _located(self, frame: Frame) -> tuple[Located, NDArray[np.float64]]:
+    def _located(self, frame: Frame) -> tuple[LocatedPixels, NDArray[np.float64]]:
         if frame.nodes is not None:
-            return frame.locate_some(LOCATED), frame.nodes
+            return frame.locate_pixel_subset(LOCATED), frame.nodes
         plane, (row_step, step) = frame.plane, LOCATED
         shape = -(-plane.rows // row_step), -(-plane.columns // step)
         elements = np.zeros(shape, dtype=np.int32)
-        maps = np.ascontiguousarray(pixel_to_index(self._volume, plane)[None])
-        return Located(elements, maps, np.empty(0, dtype=np.intp)), np.empty((0, 3))
+        maps = np.ascontiguousarray(compute_pixel_to_index(self._volume, plane)[None])
+        return LocatedPixels(elements, maps, np.empty(0, dtype=np.intp)), np.empty((0, 3))
 
     @cached_property
     def _normals(self) -> SurfaceNormals:
-        return surface_normals_of(self._volume)
+        return find_surface_normals(self._volume)
 
     def _draw(self, frame: Frame, out: NDArray[np.uint8]) -> None:
         normals = self._normals
@@ -239,7 +246,7 @@ _FRAMES = 4
 _GRAIN = (0.8, 1.4)  # standard deviations in pixels, along columns and rows
 
 
-class Noise:
+class ElectronicNoise:
     """Electronic noise of Rayleigh distribution, ``level`` dB at the face, rising by ``rise`` dB/m.
 
     It is another one from pose to pose, and the same whenever a pose is the same.
@@ -267,7 +274,7 @@ class Noise:
         grey[~shown] = 0.0
         return grey.astype(np.uint8)
 
-    def at(self, pose: Pose) -> NDArray[np.uint8]:
+    def make_noise(self, pose: Pose) -> NDArray[np.uint8]:
         """(rows, columns) grey levels with the probe at a pose."""
         bits = np.concatenate([pose.position, pose.orientation]).view(np.uint64)
         return self._frames[int(np.bitwise_xor.reduce(bits) % np.uint64(251)) % _FRAMES]
@@ -285,7 +292,7 @@ class Fibres:
         self._weights = np.empty((0, len(directions), 4), dtype=np.float32)
         self._corners = np.empty((0, 4), dtype=np.int32)
 
-    def carry(self, rest_nodes: NDArray[np.float64], corners: NDArray[np.int32]) -> None:
+    def attach_mesh(self, rest_nodes: NDArray[np.float64], corners: NDArray[np.int32]) -> None:
         """Let a mesh carry them: (N, 3) m at rest and (M, 4)."""
         edges = rest_nodes[corners[:, 1:]] - rest_nodes[corners[:, :1]]  # rows are edges
         determinant = np.linalg.det(edges)
@@ -302,8 +309,8 @@ class Fibres:
         weights[flat] = 0.0
         self._weights, self._corners = weights.astype(np.float32), corners
 
-    def now(
-        self, located: Located, nodes: NDArray[np.float64], plane: SlicePlane
+    def compute_directions(
+        self, located: LocatedPixels, nodes: NDArray[np.float64], plane: SlicePlane
     ) -> NDArray[np.float32]:
         """(E + 1, D, 2): x and z along the image of the unit direction in each map's tissue.
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import ProbeError
-from us_sim.settings.spelling import unknown
+from us_sim.settings.spelling import describe_unknown
 from us_sim.slicing.acoustics.path_loss import NOTHING, Media
 from us_sim.slicing.acoustics.settings import AROUND, Acoustics, TissueAcoustics
 from us_sim.slicing.acoustics.surface_echo import MIRROR
@@ -23,22 +23,22 @@ _SOFT = (0.8e6, 3.0e6)
 _FAINTEST = -200.0  # dB, in place of nothing
 
 
-def decibels_per_metre(attenuation: float, frequency: float) -> float:
+def convert_attenuation(attenuation: float, frequency: float) -> float:
     """dB/m that an echo loses there and back, at an attenuation in dB/cm/MHz and Hz."""
     return 2.0 * attenuation * 100.0 * frequency * 1e-6
 
 
-def reflection(before: float, behind: float) -> float:
+def compute_reflection(before: float, behind: float) -> float:
     """The fraction of the amplitude that a border of two impedances (Rayl) reflects."""
     return (behind - before) / (behind + before)
 
 
-def crossing_loss(before: float, behind: float) -> float:
+def compute_crossing_loss(before: float, behind: float) -> float:
     """dB that a border takes from an echo from behind it, there and back."""
-    return float(-20.0 * np.log10(max(1.0 - reflection(before, behind) ** 2, 1e-10)))
+    return float(-20.0 * np.log10(max(1.0 - compute_reflection(before, behind) ** 2, 1e-10)))
 
 
-def constants_by_label(volume: Volume, acoustics: Acoustics) -> dict[int, TissueAcoustics]:
+def collect_label_constants(volume: Volume, acoustics: Acoustics) -> dict[int, TissueAcoustics]:
     """The constants of each label that has a name, and of 0.
 
     Raises:
@@ -48,17 +48,19 @@ def constants_by_label(volume: Volume, acoustics: Acoustics) -> dict[int, Tissue
     for name in acoustics.tissues:
         if name not in names.values():
             known = sorted(set(names.values()))
-            raise acoustics.refused(f"tissues.{name}", f"the volume's label {unknown(name, known)}")
+            raise acoustics.make_error(
+                f"tissues.{name}", f"the volume's label {describe_unknown(name, known)}"
+            )
     found = {}
     for label, name in names.items():
         try:
-            found[label] = acoustics.of(name)
+            found[label] = acoustics.get_constants(name)
         except ProbeError as error:
-            raise acoustics.refused(f"tissues.{error.key}", error.problem) from error
+            raise acoustics.make_error(f"tissues.{error.key}", error.problem) from error
     return found
 
 
-def media_of(
+def build_media(
     volume: Volume, acoustics: Acoustics, frequency: float, step: float
 ) -> tuple[Media, list[TissueAcoustics], NDArray[np.float64]]:
     """The tables, the constants of media 1 and up, and the directions of fibres (D, 3).
@@ -67,9 +69,9 @@ def media_of(
         frequency: Hz. step: m, between samples.
 
     Raises:
-        ProbeError: as `constants_by_label`.
+        ProbeError: as `collect_label_constants`.
     """
-    by_label = constants_by_label(volume, acoustics)
+    by_label = collect_label_constants(volume, acoustics)
     of_label = np.full(256, NOTHING, dtype=np.uint8)
     constants: list[TissueAcoustics] = []
     directions: list[tuple[float, float, float]] = []
@@ -90,7 +92,7 @@ def media_of(
         assert tissue.impedance is not None
         scattering[number] = tissue.scattering
         if acoustics.attenuation:
-            per_sample = step * decibels_per_metre(1.0, frequency)
+            per_sample = step * convert_attenuation(1.0, frequency)
             loss[number] = per_sample * tissue.attenuation
             blocks[number] = not _SOFT[0] <= tissue.impedance <= _SOFT[1]
             if blocks[number]:
@@ -99,7 +101,7 @@ def media_of(
                 shadow[number] = per_sample * (tissue.attenuation - nominal)
             for other, behind in enumerate(constants, 1):
                 assert behind.impedance is not None
-                crossing[number, other] = crossing_loss(tissue.impedance, behind.impedance)
+                crossing[number, other] = compute_crossing_loss(tissue.impedance, behind.impedance)
         if tissue.fibres in directions:
             fibres[number] = directions.index(tissue.fibres)
             anisotropy[number] = tissue.anisotropy
@@ -111,7 +113,7 @@ def media_of(
     return media, constants, unit / np.linalg.norm(unit, axis=1, keepdims=True)
 
 
-def surface_levels(constants: Sequence[TissueAcoustics]) -> NDArray[np.float32]:
+def compute_surface_levels(constants: Sequence[TissueAcoustics]) -> NDArray[np.float32]:
     """(media, media) dB: the echo of a border at a right angle, where the strongest shown is 0."""
     count = 1 + len(constants)
     levels = np.full((count, count), _FAINTEST)
@@ -125,7 +127,7 @@ def surface_levels(constants: Sequence[TissueAcoustics]) -> NDArray[np.float32]:
                 continue
             assert before.impedance is not None
             assert behind.impedance is not None
-            ratio = abs(reflection(before.impedance, behind.impedance))
+            ratio = abs(compute_reflection(before.impedance, behind.impedance))
             levels[a, b] = MIRROR + 20.0 * np.log10(max(ratio, 1e-10))
     return levels.astype(np.float32)
 
@@ -164,7 +166,9 @@ class BeamGrid:
             widest = max(np.linalg.norm(np.diff(end, axis=0), axis=1).sum() for end in ends)
             self.beams = max(2, math.ceil(widest / (_PIXELS_ACROSS * math.sqrt(lateral * axial))))
             part = (np.arange(self.beams) + 0.5) / self.beams
-        self.starts, self.directions = probe.rays(np.minimum(part, 1.0))  # m, and unit: x and z
+        self.starts, self.directions = probe.compute_rays(
+            np.minimum(part, 1.0)
+        )  # m, and unit: x and z
         x = self.starts[:, 0] + self.distance[:, None] * self.directions[:, 0]
         z = self.starts[:, 1] + self.distance[:, None] * self.directions[:, 1]
         between = np.hypot(np.diff(x, axis=1), np.diff(z, axis=1))
@@ -174,7 +178,7 @@ class BeamGrid:
         left, top = probe.image_to_probe[[0, 2], 3]
         self.columns = (x - left) / lateral  # (samples, beams), fractional
         self.rows = (z - top) / axial
-        self.aperture = aperture(probe, self.distance)  # (samples,) m
+        self.aperture = compute_aperture(probe, self.distance)  # (samples,) m
         self.places = self._places(probe)
         self._shape = probe.rows, probe.columns
         self._maps = None if is_linear else self._pixel_places(probe)
@@ -216,7 +220,7 @@ class BeamGrid:
         """Rows and columns of pixels that all samples and beams of a linear array are on."""
         return self.samples * self.pixels[0], self.beams * self.pixels[1]
 
-    def on_pixels(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+    def interpolate_to_pixels(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Values (samples, beams) at the pixels (rows, columns), linear in between."""
         rows, columns = self._shape
         if self._maps is None:
@@ -235,9 +239,9 @@ def _nearest(marked: NDArray[np.bool_]) -> NDArray[np.int32]:
     return nearest
 
 
-def aperture(probe: Probe, depth: NDArray[Any]) -> NDArray[np.float64]:
+def compute_aperture(probe: Probe, depth: NDArray[Any]) -> NDArray[np.float64]:
     """(D,) m, of the face that forms an echo at depths (D,) m: as long as keeps the f-number."""
-    starts = probe.rays(np.array([0.0, 1.0]))[0]
+    starts = probe.compute_rays(np.array([0.0, 1.0]))[0]
     length = float(np.linalg.norm(starts[1] - starts[0]))
     length = max(length, getattr(probe, "aperture", 0.0))  # a phased array uses all of its face
     least, most = _APERTURE

@@ -62,7 +62,7 @@ class Crossings(NamedTuple):
     level: NDArray[np.float32]  # dB of the soft loss and the time gain there
 
 
-def room_for_crossings(count: int) -> Crossings:
+def allocate_crossings(count: int) -> Crossings:
     """Room for so many."""
     return Crossings(
         np.empty(count, np.int32), np.empty(count, np.float32), np.empty((count, 2), np.uint8),
@@ -72,7 +72,7 @@ def room_for_crossings(count: int) -> Crossings:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def follow_beams(
+def trace_beams(
     elements, wide, steps, maps, voxels, shape, places, lines, across, along, media, time_gain,
     fibre, gain, blocked, blocker, crossings,
 ):  # fmt: skip
@@ -274,7 +274,7 @@ def _medium_in(x, y, z, voxels, sides, of_label):
 
 
 @njit(inline="always", error_model="numpy")
-def medium_at(x, y, z, voxels, sides, ends, of_label):
+def find_medium(x, y, z, voxels, sides, ends, of_label):
     """The medium at a voxel index: of the nearest voxel, `NOTHING` beyond the volume.
 
     Args:
@@ -424,7 +424,7 @@ def sharpen_edges(
 
     Args:
         elements: (pixels,) flat, ``wide`` a row, every ``steps`` (2,) rows and columns.
-        maps, voxels, shape, lines, media: as for `path_loss.follow_beams`.
+        maps, voxels, shape, lines, media: as for `path_loss.trace_beams`.
         blocked, blocker: (samples, beams) float32, changed.
     """
     last = samples - 1
@@ -487,7 +487,7 @@ def _is_blocked(k, part, dark, elements, wide, steps, maps, voxels, shape, lines
         medium = np.uint8(NOTHING)
         if element >= 0:
             m = maps[element]
-            medium = medium_at(
+            medium = find_medium(
                 m[0, 0] + m[0, 1] * column + m[0, 2] * row,
                 m[1, 0] + m[1, 1] * column + m[1, 2] * row,
                 m[2, 0] + m[2, 1] * column + m[2, 2] * row,

@@ -43,7 +43,7 @@ _TABLE = {
 }
 
 
-def table_constants(name: str) -> tuple[float, float] | None:
+def find_table_constants(name: str) -> tuple[float, float] | None:
     """Attenuation (dB/cm/MHz) and impedance (Rayl) of the tissue that a label names.
 
     Of several known words in a name the last one counts; None where there is none. Attenuation is
@@ -102,25 +102,25 @@ class TissueAcoustics(Settings):
     def check(self) -> None:
         """Fibres have a direction, if any."""
         if self.fibres is not None and not any(self.fibres):
-            raise self.refused("fibres", "0, 0, 0 is no direction: leave it out for none")
+            raise self.make_error("fibres", "0, 0, 0 is no direction: leave it out for none")
 
     @property
     def has_fibres(self) -> bool:
         """Whether its echoes depend on a direction."""
         return self.fibres is not None and self.anisotropy > 0.0
 
-    def resolved(self, name: str) -> TissueAcoustics:
+    def fill_from_table(self, name: str) -> TissueAcoustics:
         """With the textbook's constants of a label's name where none are given.
 
         Raises:
             ProbeError: the textbook has none for that name; ``key`` says which.
         """
-        found = table_constants(name)
+        found = find_table_constants(name)
         values: dict[str, Any] = {}
         for place, key in enumerate(("attenuation", "impedance")):
             if getattr(self, key) is None:
                 if found is None:
-                    raise self.refused(
+                    raise self.make_error(
                         f"{name}.{key}",
                         f"is missing, and the table of textbooks' constants has no tissue of the "
                         f"name `{name}`: give its {key}",
@@ -180,7 +180,7 @@ class SoundSettings(Settings):
         """Whether artefacts are made along the beams."""
         return self.artefacts == "live"
 
-    def frequency_among(self, frequencies: tuple[float, float]) -> float:
+    def choose_frequency(self, frequencies: tuple[float, float]) -> float:
         """Hz: the frequency that is set, or the middle of those that a probe has.
 
         Raises:
@@ -190,7 +190,7 @@ class SoundSettings(Settings):
         if self.frequency is None:
             return math.sqrt(low * high)
         if not low <= self.frequency <= high:
-            raise self.refused(
+            raise self.make_error(
                 "frequency",
                 f"{self.frequency * 1e-6:g} MHz is not one that this probe has, which are "
                 f"{low * 1e-6:g} to {high * 1e-6:g} MHz (probe.frequencies)",
@@ -206,10 +206,10 @@ class Acoustics(SoundSettings):
         description="constants by label; of what is not said, the textbook's", default_factory=dict
     )
 
-    def of(self, name: str) -> TissueAcoustics:
+    def get_constants(self, name: str) -> TissueAcoustics:
         """The constants of the tissue with a label of that name.
 
         Raises:
             ProbeError: it has none.
         """
-        return self.tissues.get(name, TissueAcoustics()).resolved(name)
+        return self.tissues.get(name, TissueAcoustics()).fill_from_table(name)

@@ -33,7 +33,7 @@ _LONGEST = 1.2  # pulse lengths on either side of a border that are drawn
 _FLAT = 1e-30
 
 
-def angle_loss(cosine: Any) -> Any:
+def compute_angle_loss(cosine: Any) -> Any:
     """dB by which a border is fainter, seen at an angle with that cosine (any shape)."""
     square = np.maximum(np.square(cosine), 1e-6)
     facets = np.exp(-(1.0 - square) / square / (2.0 * ROUGHNESS**2))
@@ -56,7 +56,9 @@ def _grain() -> np.ndarray:
     return np.asarray(level - level.mean(), dtype=np.float32)
 
 
-ANGLES = np.asarray(angle_loss(np.arange(257) / 256.0), np.float32)  # at even cosines from 0 to 1
+ANGLES = np.asarray(
+    compute_angle_loss(np.arange(257) / 256.0), np.float32
+)  # at even cosines from 0 to 1
 GRAIN = _grain()
 
 
@@ -73,7 +75,7 @@ def draw_surfaces(
         surface: (media, media) float32 dB, of a border at a right angle.
         normals, blocks: as `SurfaceNormals`. shape: (3,) of the volume.
         rest_index: (N, 3) voxels, where the nodes are at rest. nodes: (N, 3) m, where they are.
-        tetrahedra: as `Located`. corners: (M, 4) nodes of the mesh's tetrahedra.
+        tetrahedra: as `LocatedPixels`. corners: (M, 4) nodes of the mesh's tetrahedra.
         rigid: (3, 3) from m to voxels, of tissue as at rest.
         beam_axes: (2, 3) unit vectors along the image's columns and rows, in ``patient``.
         step: m between samples. spacing: (samples,) m between beams.
@@ -245,7 +247,7 @@ class SurfaceNormals:
         self.normals = np.zeros((count, BLOCK**3, 4), dtype=np.int8)
         _fill_normals(flat, shape, weights, _DISTANCES, self.blocks, self.normals)
 
-    def at(self, i: int, j: int, k: int) -> tuple[NDArray[np.float64], float]:
+    def get_normal(self, i: int, j: int, k: int) -> tuple[NDArray[np.float64], float]:
         """(3,) into the voxel's own label, of length 1, and how many voxels away the surface is.
 
         Zeros where there is no surface.
@@ -276,7 +278,7 @@ _DISTANCES = _distances()
 _found: WeakValueDictionary[tuple[int, tuple[int, ...]], SurfaceNormals] = WeakValueDictionary()
 
 
-def surface_normals_of(volume: Volume) -> SurfaceNormals:
+def find_surface_normals(volume: Volume) -> SurfaceNormals:
     """The normals of a volume's labels, found when they are first asked for (about a second).
 
     They are kept while somebody uses them, also for a volume of the same labels in another place.

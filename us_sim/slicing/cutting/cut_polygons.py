@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.kernels import njit
-from us_sim.slicing.cutting.section import ON_PLANE, adjugate, is_solid
+from us_sim.slicing.cutting.section import ON_PLANE, compute_adjugate, is_solid
 from us_sim.slicing.probe.plane import SlicePlane
 
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
@@ -48,7 +48,7 @@ class Cuts(NamedTuple):
     owner: NDArray[np.int32]  # (outlines,) which cut it closes
 
 
-def room_for_cuts(count: int) -> Cuts:
+def allocate_cuts(count: int) -> Cuts:
     """Room for the cuts of that many tetrahedra, even if all are inverted."""
     many = 4 * count + 1  # one more for the rigid map
     return Cuts(
@@ -200,7 +200,7 @@ def _is_on_image(place, polygon, sides, columns, rows):
 @njit(inline="always", error_model="numpy")
 def _map_to_rest(place, corners, pixel_volume, rest_determinant, rest_index, form):
     """Fills the (3, 3) map of a tetrahedron; returns whether it is neither inverted nor flat."""
-    determinant, to_1, to_2, to_3 = adjugate(place, 0, 1, 2, 3)
+    determinant, to_1, to_2, to_3 = compute_adjugate(place, 0, 1, 2, 3)
     if not is_solid(determinant, pixel_volume, rest_determinant):
         return False
     r = 1.0 / determinant
@@ -228,7 +228,7 @@ def _is_gentle(form):
 
 
 @njit(inline="always", error_model="numpy")
-def face_cut(place, a, b, c, points):
+def cut_face(place, a, b, c, points):
     """Fills the points that span the closed cut of a face; returns how many of three there are."""
     count = 0
     for k in (a, b, c):
@@ -249,7 +249,7 @@ def face_cut(place, a, b, c, points):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _close_face(place, f, columns, rows, cuts, pieces, count):
     points = cuts.outlines[pieces]
-    number = face_cut(place, FACES[f, 0], FACES[f, 1], FACES[f, 2], points)
+    number = cut_face(place, FACES[f, 0], FACES[f, 1], FACES[f, 2], points)
     if number == 0 or not _is_on_image(place, points, number, columns, rows):
         return pieces
     cuts.points[pieces] = number
@@ -328,7 +328,7 @@ class RestSurface:
             0,
         )
 
-    def cut(self, plane: SlicePlane) -> Outline:
+    def cut_plane(self, plane: SlicePlane) -> Outline:
         """The cut by the plane of an image; overwritten by the next."""
         count = _cut(
             self._nodes, self._triangles, plane.to_pixel, plane.columns, plane.rows, self._places,
@@ -351,7 +351,7 @@ def _cut(nodes, triangles, to_pixel, columns, rows, place, outlines, points, tur
         if least > 0.0 or max(max(place[a, 2], place[b, 2]), place[c, 2]) < 0.0:
             continue
         outline = outlines[count]
-        number = face_cut(place, a, b, c, outline)
+        number = cut_face(place, a, b, c, outline)
         left = outline[0, 0]
         top = outline[0, 1]
         bottom = outline[0, 1]
@@ -407,14 +407,14 @@ def mark_covered(outlines, points, turns, number, row, winding, covered):
         height = outlines[q, b, 1] - start
         if start <= row < outlines[q, b, 1]:
             slope = (outlines[q, b, 0] - outlines[q, a, 0]) / height
-            at = up_to(outlines[q, a, 0] + (row - start) * slope, 0, columns)
+            at = ceil_clamped(outlines[q, a, 0] + (row - start) * slope, 0, columns)
             winding[at] += turns[q]
     turn = 0
     for i in range(columns):
         turn += winding[i]
         covered[i] = turn != 0
     for q in range(number):
-        first, end = closed_columns(outlines[q], points[q], row, columns)
+        first, end = find_closed_columns(outlines[q], points[q], row, columns)
         for i in range(first, end):
             covered[i] = True
 
@@ -455,9 +455,9 @@ def convert_cuts(
         for k in range(points[q]):
             top = min(top, outlines[q, k, 1])
             bottom = max(bottom, outlines[q, k, 1])
-        for row in range(up_to(top - _CLOSE, first_row, end_row),
-                         min(up_to(bottom + _CLOSE, first_row, end_row) + 1, end_row)):  # fmt: skip
-            first, end = closed_columns(outlines[q], points[q], row, columns)
+        for row in range(ceil_clamped(top - _CLOSE, first_row, end_row),
+                         min(ceil_clamped(bottom + _CLOSE, first_row, end_row) + 1, end_row)):  # fmt: skip
+            first, end = find_closed_columns(outlines[q], points[q], row, columns)
             _add(owner[q], first, end, row, runs, kinds, spans, used)
     for q in range(count):
         if sides[q] == 0:
@@ -467,8 +467,8 @@ def convert_cuts(
         for k in range(sides[q]):
             top = min(top, corners[q, k, 1])
             bottom = max(bottom, corners[q, k, 1])
-        above = up_to(top, first_row, end_row)
-        below = up_to(bottom, first_row, end_row)
+        above = ceil_clamped(top, first_row, end_row)
+        below = ceil_clamped(bottom, first_row, end_row)
         for row in range(above, below):
             low[np.uint64(row - first_row)] = columns
             high[np.uint64(row - first_row)] = 0
@@ -479,9 +479,10 @@ def convert_cuts(
             start = corners[q, a, 1]
             slope = (corners[q, b, 0] - column) / (corners[q, b, 1] - start)
             for row in range(
-                up_to(start, first_row, end_row), up_to(corners[q, b, 1], first_row, end_row)
+                ceil_clamped(start, first_row, end_row),
+                ceil_clamped(corners[q, b, 1], first_row, end_row),
             ):
-                at = up_to(column + (row - start) * slope, 0, columns)
+                at = ceil_clamped(column + (row - start) * slope, 0, columns)
                 line = np.uint64(row - first_row)
                 low[line] = min(low[line], at)
                 high[line] = max(high[line], at)
@@ -495,7 +496,7 @@ def convert_cuts(
 
 
 @njit(inline="always", error_model="numpy")
-def up_to(value, least, most):
+def ceil_clamped(value, least, most):
     """The least whole number not below a value, held between two others; the first if not one."""
     held = value if value > least else np.float64(least)
     held = held if held < most else np.float64(most)
@@ -516,7 +517,7 @@ def _add(q, first, end, row, runs, kinds, spans, used):
 
 
 @njit(inline="always", error_model="numpy")
-def closed_columns(outline, points, row, columns):
+def find_closed_columns(outline, points, row, columns):
     """First and end column of a row that lie on a closed point, segment or triangle."""
     left = np.inf
     right = -np.inf
@@ -536,8 +537,8 @@ def closed_columns(outline, points, row, columns):
         to_b = outline[a, 0] + u * (outline[b, 0] - outline[a, 0])
         left = min(left, min(from_a, to_b))
         right = max(right, max(from_a, to_b))
-    first = up_to(left - _CLOSE, 0, columns)
-    end = up_to(right + _CLOSE, 0, columns)
+    first = ceil_clamped(left - _CLOSE, 0, columns)
+    end = ceil_clamped(right + _CLOSE, 0, columns)
     # The end is just beyond the last column that is not right of the outline.
     if right + _CLOSE >= 0.0 and np.floor(right + _CLOSE) < columns and end <= right + _CLOSE:
         end += 1

@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from us_sim.kernels import njit
 from us_sim.slicing.cutting.resampling import (
     BLACK,
-    Located,
-    label_voxels,
-    parallel_rows,
-    pixel_to_index,
+    LocatedPixels,
+    compute_pixel_to_index,
+    get_label_voxels,
+    run_rows_in_parallel,
 )
-from us_sim.slicing.cutting.section import INSIDE, finite_nodes
+from us_sim.slicing.cutting.section import INSIDE, require_finite_nodes
 from us_sim.slicing.cutting.slicer import Slicer
 from us_sim.slicing.cutting.span_sampling import SLACK
 from us_sim.slicing.probe.plane import SlicePlane
@@ -31,7 +31,7 @@ _FLAT = 1e-6  # fraction of its rest volume below which a tetrahedron is flat
 class PerPixel(Slicer):
     """Locates every pixel by brute force."""
 
-    def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
+    def cut_image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
         inside, index = self._voxels(nodes, plane)
         lower = np.minimum(index.astype(np.int64), np.maximum(np.array(self._volume.shape) - 2, 0))
         upper = np.minimum(lower + 1, np.array(self._volume.shape) - 1)
@@ -45,38 +45,38 @@ class PerPixel(Slicer):
         image[inside] = np.floor(grey + 0.5)
         return image
 
-    def labels(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
-        labels = label_voxels(self._volume)[0].reshape(self._volume.shape)
+    def cut_labels(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
+        labels = get_label_voxels(self._volume)[0].reshape(self._volume.shape)
         inside, index = self._voxels(nodes, plane)
         image = np.zeros(inside.shape, dtype=np.uint8)
         image[inside] = labels[tuple((index + 0.5).astype(np.int64).T)]
         return image
 
-    def rest_coordinates(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.float64]:
-        moved = finite_nodes(nodes, len(self._mesh.nodes))
+    def compute_rest_coordinates(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.float64]:
+        moved = require_finite_nodes(nodes, len(self._mesh.nodes))
         covered, *_ = self._place(self._mesh.nodes, plane)
         rest, *_ = self._place(moved, plane)
         outside = np.isnan(rest[..., 0])
-        rest[outside] = plane.pixels()[outside]
+        rest[outside] = plane.compute_pixel_positions()[outside]
         rest[outside & ~np.isnan(covered[..., 0])] = np.nan
-        rest[~plane.is_shown()] = np.nan
+        rest[~plane.make_shown_mask()] = np.nan
         return rest
 
-    def locate(self, nodes: ArrayLike, plane: SlicePlane) -> Located:
-        moved = finite_nodes(nodes, len(self._mesh.nodes))
+    def locate_pixels(self, nodes: ArrayLike, plane: SlicePlane) -> LocatedPixels:
+        moved = require_finite_nodes(nodes, len(self._mesh.nodes))
         covered, *_ = self._place(self._mesh.nodes, plane)
         rest, kept, elements = self._place(moved, plane)
         elements[elements < 0] = len(kept)
         elements[np.isnan(rest[..., 0]) & ~np.isnan(covered[..., 0])] = BLACK
-        elements[~plane.is_shown()] = BLACK
+        elements[~plane.make_shown_mask()] = BLACK
         corners = (
             moved[self._mesh.tetrahedra[kept]] @ plane.to_pixel[:, :3].T + plane.to_pixel[:, 3]
         )
         index = self._mesh.rest_index[self._mesh.tetrahedra[kept]]
         ones = np.ones((len(kept), 4, 1))
         maps = np.linalg.solve(np.concatenate([ones, corners], axis=2), index).transpose(0, 2, 1)
-        rigid = pixel_to_index(self._volume, plane)[None]
-        return Located(elements, np.concatenate([maps[..., :3], rigid]), kept)
+        rigid = compute_pixel_to_index(self._volume, plane)[None]
+        return LocatedPixels(elements, np.concatenate([maps[..., :3], rigid]), kept)
 
     def _voxels(
         self, nodes: ArrayLike, plane: SlicePlane
@@ -86,7 +86,7 @@ class PerPixel(Slicer):
         The outer half voxel takes the index of the outermost centre.
         """
         to_index, shape = self._volume.patient_to_index, np.array(self._volume.shape)
-        index = self.rest_coordinates(nodes, plane) @ to_index[:3, :3].T + to_index[:3, 3]
+        index = self.compute_rest_coordinates(nodes, plane) @ to_index[:3, :3].T + to_index[:3, 3]
         inside = ((index >= -0.5 - SLACK) & (index <= shape - 0.5 + SLACK)).all(axis=-1)
         return np.asarray(inside), np.clip(index[inside], 0, shape - 1)
 
@@ -110,7 +110,7 @@ class PerPixel(Slicer):
         rest = np.full((plane.rows, plane.columns, 3), np.nan)
         elements = np.full(rest.shape[:2], -1, dtype=np.int32)
         locate = partial(_locate, corners[kept], places[kept], first, last, rest, elements)
-        parallel_rows(self._threads, plane.rows, locate)
+        run_rows_in_parallel(self._threads, plane.rows, locate)
         self.skipped = int((met & ~valid).sum())
         return rest, np.flatnonzero(kept), elements
 

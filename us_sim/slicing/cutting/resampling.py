@@ -1,10 +1,10 @@
 """Where the pixels of an image lie at rest, and the volume's values there.
 
 >>> import numpy as np
->>> from us_sim.slicing.cutting.resampling import Located
+>>> from us_sim.slicing.cutting.resampling import LocatedPixels
 >>> shift = np.array([[[5.0, 1, 0], [5, 0, 0], [0, 0, 1]]])  # five voxels along the first two axes
->>> located = Located(np.zeros((2, 3), np.int32), np.concatenate([shift, shift]), np.array([7]))
->>> located.rest_index()[1, 2]
+>>> located = LocatedPixels(np.zeros((2, 3), np.int32), np.concatenate([shift, shift]), np.array([7]))
+>>> located.compute_rest_index()[1, 2]
 array([7., 5., 1.])
 """
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from us_sim.volume.volume import Volume
 
 
-def parallel_rows(
+def run_rows_in_parallel(
     threads: int, rows: int, work: Callable[[int, int], object], *, band: int = 1
 ) -> None:
     """Do ``work(first_row, end_row)`` for all rows in parallel, one run of them a thread.
@@ -62,14 +62,14 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 BLACK = -1  # the element of a pixel that shows nothing, as where tissue moved away
 
 
-class Located(NamedTuple):
+class LocatedPixels(NamedTuple):
     """The E tetrahedra that an image shows, and which of them each pixel lies in."""
 
     elements: NDArray[np.int32]  # (rows, columns) number of a map; E outside the mesh, or BLACK
     maps: NDArray[np.float64]  # (E + 1, 3, 3) from (1, column, row) to voxel indices at rest
     tetrahedra: NDArray[np.intp]  # (E,) the mesh's own numbers of those that maps are of
 
-    def rest_index(self) -> NDArray[np.float64]:
+    def compute_rest_index(self) -> NDArray[np.float64]:
         """(rows, columns, 3) voxel indices of where each pixel's tissue lies at rest.
 
         Outside the mesh that is the pixel itself; NaN where nothing is shown.
@@ -81,13 +81,13 @@ class Located(NamedTuple):
         index[self.elements == BLACK] = np.nan
         return np.asarray(index)
 
-    def some(self, steps: tuple[int, int]) -> Located:
+    def take_every(self, steps: tuple[int, int]) -> LocatedPixels:
         """Every so many-th row and column of the elements, with the same maps."""
         elements = np.ascontiguousarray(self.elements[:: steps[0], :: steps[1]])
-        return Located(elements, self.maps, self.tetrahedra)
+        return LocatedPixels(elements, self.maps, self.tetrahedra)
 
 
-def evaluate(
+def evaluate_affine(
     maps: NDArray[np.float64], elements: NDArray[np.int32], *, threads: int = 1
 ) -> NDArray[np.float32]:
     """Values (rows, columns, K) of functions affine in (column, row) in each tetrahedron.
@@ -101,7 +101,7 @@ def evaluate(
     """
     values = np.empty((*elements.shape, maps.shape[1]), dtype=np.float32)
     maps = np.ascontiguousarray(maps, dtype=np.float64)
-    parallel_rows(
+    run_rows_in_parallel(
         threads, len(elements), lambda first, end: _evaluate(maps, elements, first, end, values)
     )
     return values
@@ -139,12 +139,12 @@ def sample_plane(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDAr
     Raises:
         VolumeError: the volume has too many voxels.
     """
-    voxels, shape = grey_voxels(volume)
-    runs = full_runs(plane) if plane.spans is None else plane.spans
+    voxels, shape = get_grey_voxels(volume)
+    runs = make_full_runs(plane) if plane.spans is None else plane.spans
     # One map holds on whole rows, so that no pixel is left to lie outside a mesh.
     spans = np.full((plane.rows, 1), plane.columns << END_SHIFT, dtype=np.int64)
     used = np.ones(plane.rows, dtype=np.int32)
-    maps, inside = pixel_to_index(volume, plane)[None], np.zeros(1, dtype=np.bool_)
+    maps, inside = compute_pixel_to_index(volume, plane)[None], np.zeros(1, dtype=np.bool_)
     image = np.empty((plane.rows, plane.columns), dtype=np.uint8)
 
     def draw(first_row: int, end_row: int) -> None:
@@ -153,7 +153,7 @@ def sample_plane(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDAr
             first_row, end_row, image,
         )  # fmt: skip
 
-    parallel_rows(threads, plane.rows, draw)
+    run_rows_in_parallel(threads, plane.rows, draw)
     return image
 
 
@@ -163,13 +163,13 @@ def sample_labels(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDA
     Raises:
         VolumeError: the volume has no labels.
     """
-    voxels, shape = label_voxels(volume)
-    maps = pixel_to_index(volume, plane)[None]
+    voxels, shape = get_label_voxels(volume)
+    maps = compute_pixel_to_index(volume, plane)[None]
     elements = np.zeros((plane.rows, plane.columns), dtype=np.int32)
     if plane.spans is not None:
-        elements[~plane.is_shown()] = BLACK
+        elements[~plane.make_shown_mask()] = BLACK
     image = np.empty(elements.shape, dtype=np.uint8)
-    parallel_rows(
+    run_rows_in_parallel(
         threads,
         plane.rows,
         lambda a, b: sample_nearest(voxels, shape, maps, elements, a, b, image),
@@ -177,7 +177,7 @@ def sample_labels(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDA
     return image
 
 
-def full_runs(plane: SlicePlane) -> NDArray[np.int32]:
+def make_full_runs(plane: SlicePlane) -> NDArray[np.int32]:
     """(rows, 2, 2) as `SlicePlane.spans`, for an image that fills its grid."""
     runs = np.zeros((plane.rows, 2, 2), dtype=np.int32)
     runs[:, 0, 1] = plane.columns
@@ -185,7 +185,7 @@ def full_runs(plane: SlicePlane) -> NDArray[np.int32]:
     return runs
 
 
-def pixel_to_index(volume: Volume, plane: SlicePlane) -> NDArray[np.float64]:
+def compute_pixel_to_index(volume: Volume, plane: SlicePlane) -> NDArray[np.float64]:
     """(3, 3) map from (1, column, row) to voxel indices, for a plane through the rigid volume."""
     to_index = volume.patient_to_index
     steps = np.column_stack([plane.origin, plane.column_step, plane.row_step])
@@ -194,7 +194,7 @@ def pixel_to_index(volume: Volume, plane: SlicePlane) -> NDArray[np.float64]:
     return steps
 
 
-def voxels_of(array: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+def flatten_voxels(array: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
     """A volume's voxels as the kernels take them: flat and read-only, and their shape (3,)."""
     # Read-only always, since numba would compile the kernels again for memory-mapped volumes.
     flat = np.asarray(array).reshape(-1)
@@ -202,7 +202,7 @@ def voxels_of(array: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.i
     return flat, np.array(array.shape, dtype=np.int64)
 
 
-def grey_voxels(volume: Volume) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+def get_grey_voxels(volume: Volume) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
     """The grey values' voxels as `sample_spans` takes them.
 
     Raises:
@@ -214,14 +214,14 @@ def grey_voxels(volume: Volume) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
             f"the volume has {intensities.shape} voxels: cut or coarsen it to at most "
             f"{MOST_VOXELS_A_SIDE} a side and {MOST_VOXELS} in all"
         )
-    voxels, shape = voxels_of(intensities)
+    voxels, shape = flatten_voxels(intensities)
     if intensities.shape[2] == 1:
         # Nothing follows the last voxel of a row; a volume so thin is small.
-        voxels, _ = voxels_of(np.repeat(intensities, 2, axis=2))
+        voxels, _ = flatten_voxels(np.repeat(intensities, 2, axis=2))
     return voxels, shape
 
 
-def label_voxels(volume: Volume) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+def get_label_voxels(volume: Volume) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
     """The labels' voxels as the kernels take them.
 
     Raises:
@@ -229,7 +229,7 @@ def label_voxels(volume: Volume) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
     """
     if volume.labels is None:
         raise VolumeError("the volume has no labels: give one with a segmentation")
-    return voxels_of(volume.labels)
+    return flatten_voxels(volume.labels)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -1,6 +1,6 @@
 """Exact images of deformed tissue: every tetrahedron that an image cuts is scan-converted.
 
-`section.Clusters` finds the tetrahedra that the image may meet; `cut_polygons` gives each its
+`section.TetrahedronClusters` finds the tetrahedra that the image may meet; `cut_polygons` gives each its
 polygon, the affine map from pixels to rest, and the spans of pixels in it; `span_sampling` looks
 these up in the volume. The outline of the mesh at rest tells tissue that was pushed away from what
 lies beside it.
@@ -17,7 +17,7 @@ lies beside it.
 >>> mesh = box_mesh([-0.02, 0.02], [-0.02, 0.02], [0.0, 0.02, 0.04])
 >>> slicer = ScanConversion(Volume(ramp, to_patient, None, {}), mesh.nodes, mesh.tetrahedra)
 >>> plane = LinearProbe(aperture=0.02, depth=0.02, columns=8, rows=5).plane(Pose())
->>> slicer.image(mesh.nodes * [1, 1, 0.5], plane)[:, 0]
+>>> slicer.cut_image(mesh.nodes * [1, 1, 0.5], plane)[:, 0]
 array([ 4, 12, 20, 28, 36], dtype=uint8)
 """
 
@@ -26,29 +26,29 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from us_sim.geometry.mesh_faces import face_order
+from us_sim.geometry.mesh_faces import sort_faces
 from us_sim.slicing.cutting.cut_polygons import (
     NO_OUTLINE,
     Outline,
     RestSurface,
+    allocate_cuts,
     convert_cuts,
     cut_tetrahedra,
-    room_for_cuts,
 )
 from us_sim.slicing.cutting.resampling import (
     BLACK,
-    Located,
-    full_runs,
-    grey_voxels,
-    parallel_rows,
-    pixel_to_index,
+    LocatedPixels,
+    compute_pixel_to_index,
+    get_grey_voxels,
+    make_full_runs,
+    run_rows_in_parallel,
 )
-from us_sim.slicing.cutting.section import Clusters, finite_nodes
+from us_sim.slicing.cutting.section import TetrahedronClusters, require_finite_nodes
 from us_sim.slicing.cutting.slicer import Slicer
 from us_sim.slicing.cutting.span_sampling import (
     INNER_MARGIN,
+    fill_element_subset,
     fill_elements,
-    fill_some_elements,
     sample_spans,
 )
 from us_sim.slicing.probe.plane import SlicePlane
@@ -59,7 +59,7 @@ class ScanConversion(Slicer):
 
     def _prepare(self) -> None:
         volume, mesh = self._volume, self._mesh
-        self._clusters = Clusters(mesh.nodes, mesh.tetrahedra)
+        self._clusters = TetrahedronClusters(mesh.nodes, mesh.tetrahedra)
         self._determinants = mesh.determinants[self._clusters.order]
         self._rest_index = mesh.rest_index
         self._within = _among_centres(mesh.rest_index, self._clusters.tetrahedra, volume.shape)
@@ -67,16 +67,16 @@ class ScanConversion(Slicer):
         self._surface = RestSurface(
             mesh.nodes, self._clusters.tetrahedra, self._determinants, self._neighbours
         )
-        self._voxels, self._shape = grey_voxels(volume)
+        self._voxels, self._shape = get_grey_voxels(volume)
         self._moved = np.empty(mesh.nodes.shape)
-        self._cuts = room_for_cuts(256)
+        self._cuts = allocate_cuts(256)
         self._spans = np.empty((0, 0), dtype=np.int64)
         self._used = np.empty(0, dtype=np.int32)
         self._full = np.empty((0, 2, 2), dtype=np.int32)
         # Of the latest image, while its cuts and spans are there.
         self._drawn: tuple[ArrayLike, SlicePlane, int, Outline] | None = None
 
-    def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
+    def cut_image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
         count, pieces, outline, is_covered = self._cut(nodes, plane)
         runs = self._shown(plane)
         image = np.empty((plane.rows, plane.columns), dtype=np.uint8)
@@ -91,28 +91,30 @@ class ScanConversion(Slicer):
                 self._used, runs, is_covered, *outline, first_row, end_row, image,
             )  # fmt: skip
 
-        parallel_rows(self._threads, plane.rows, draw)
+        run_rows_in_parallel(self._threads, plane.rows, draw)
         return image
 
-    def locate(self, nodes: ArrayLike, plane: SlicePlane) -> Located:
+    def locate_pixels(self, nodes: ArrayLike, plane: SlicePlane) -> LocatedPixels:
         count, outline, runs, spans = self._spans_of(nodes, plane)
         elements = np.empty((plane.rows, plane.columns), dtype=np.int32)
         fill_elements(spans, self._used, runs, count, BLACK, *outline, elements)
         return self._located(elements, count)
 
-    def locate_some(self, nodes: ArrayLike, plane: SlicePlane, steps: tuple[int, int]) -> Located:
+    def locate_pixel_subset(
+        self, nodes: ArrayLike, plane: SlicePlane, steps: tuple[int, int]
+    ) -> LocatedPixels:
         count, outline, runs, spans = self._spans_of(nodes, plane)
         shape = -(-plane.rows // steps[0]), -(-plane.columns // steps[1])
         elements = np.empty(shape, dtype=np.int32)
-        fill_some_elements(
+        fill_element_subset(
             spans, self._used, runs, count, BLACK, *outline, np.array(steps), plane.columns,
             elements,
         )  # fmt: skip
         return self._located(elements, count)
 
-    def _located(self, elements: NDArray[np.int32], count: int) -> Located:
+    def _located(self, elements: NDArray[np.int32], count: int) -> LocatedPixels:
         tetrahedra = self._clusters.order[self._cuts.tetrahedra[:count]]
-        return Located(elements, self._cuts.maps[: count + 1].copy(), tetrahedra)
+        return LocatedPixels(elements, self._cuts.maps[: count + 1].copy(), tetrahedra)
 
     def _spans_of(
         self, nodes: ArrayLike, plane: SlicePlane
@@ -132,23 +134,23 @@ class ScanConversion(Slicer):
         """
         moved = self._as_kernels_take(nodes)
         self._drawn = None
-        near = self._clusters.near(moved, plane)
+        near = self._clusters.find_near_plane(moved, plane)
         if 4 * len(near) >= len(self._cuts.sides):
-            self._cuts = room_for_cuts(2 * len(near))
+            self._cuts = allocate_cuts(2 * len(near))
         count, pieces, self.skipped, is_covered = cut_tetrahedra(
             near, moved, plane.to_pixel, float(np.linalg.det(plane.basis)), plane.columns,
             plane.rows, self._clusters.tetrahedra, self._neighbours, self._determinants,
             self._rest_index, self._within, self._cuts,
         )  # fmt: skip
-        self._cuts.maps[count] = pixel_to_index(self._volume, plane)
-        outline = NO_OUTLINE if is_covered else self._surface.cut(plane)
+        self._cuts.maps[count] = compute_pixel_to_index(self._volume, plane)
+        outline = NO_OUTLINE if is_covered else self._surface.cut_plane(plane)
         return count, pieces, outline, is_covered
 
     def _as_kernels_take(self, nodes: ArrayLike) -> NDArray[np.float64]:
         """Nodes (N, 3) m, contiguous float64, without a copy where they are so."""
         array = np.asarray(nodes)
         if array.shape != self._moved.shape:
-            finite_nodes(array, len(self._moved))
+            require_finite_nodes(array, len(self._moved))
         if array.dtype == np.float64 and array.flags.c_contiguous:
             return array
         self._moved[:] = array
@@ -165,7 +167,7 @@ class ScanConversion(Slicer):
         if plane.spans is not None:
             return plane.spans
         if len(self._full) != plane.rows or self._full[0, 0, 1] != plane.columns:
-            self._full = full_runs(plane)
+            self._full = make_full_runs(plane)
         return self._full
 
     def _convert(
@@ -199,7 +201,7 @@ def _neighbours(
     A tetrahedron that is flat at rest is nobody's neighbour.
     """
     solid = np.flatnonzero(determinants).astype(np.int32)
-    order, starts, counts = face_order(tetrahedra[solid])
+    order, starts, counts = sort_faces(tetrahedra[solid])
     first = starts[counts == 2]
     one, other = order[first], order[first + 1]
     of_solid = np.full(4 * len(solid), -1, dtype=np.int32)

@@ -18,7 +18,7 @@ FLAT = 1e-6
 
 
 @njit(inline="always", error_model="numpy")
-def adjugate(place, n0, n1, n2, n3):
+def compute_adjugate(place, n0, n1, n2, n3):
     """A tetrahedron's determinant, and the barycentric coordinates of its last three corners.
 
     Each is three coefficients, of 1, column and row, times the determinant.
@@ -83,7 +83,7 @@ class RestMesh:
     def __init__(
         self, nodes: ArrayLike, tetrahedra: ArrayLike, patient_to_index: NDArray[np.float64]
     ) -> None:
-        self.nodes = finite_nodes(nodes, None)
+        self.nodes = require_finite_nodes(nodes, None)
         corners = np.asarray(tetrahedra)
         if corners.ndim != 2 or corners.shape[1] != 4 or corners.dtype.kind not in "iu":
             raise MeshError(
@@ -103,7 +103,7 @@ class RestMesh:
         )
 
 
-def finite_nodes(nodes: ArrayLike, count: int | None) -> NDArray[np.float64]:
+def require_finite_nodes(nodes: ArrayLike, count: int | None) -> NDArray[np.float64]:
     """Node positions as the kernels take them: (N, 3) float64, contiguous and finite.
 
     Raises:
@@ -129,7 +129,7 @@ _BLOCK = 256  # nodes that are tested together
 _MARGIN = 1e-3  # pixels beyond the image's border at which a tetrahedron may be left out
 
 
-class Clusters:
+class TetrahedronClusters:
     """A mesh's tetrahedra in an order in which neighbours are near each other.
 
     Args:
@@ -157,7 +157,7 @@ class Clusters:
         self._sides = np.empty(len(rest_nodes), dtype=np.uint8)
         self._near = np.empty(len(tetrahedra), dtype=np.int32)
 
-    def near(self, nodes: NDArray[np.float64], plane: SlicePlane) -> NDArray[np.int32]:
+    def find_near_plane(self, nodes: NDArray[np.float64], plane: SlicePlane) -> NDArray[np.int32]:
         """(K,) tetrahedra that are not wholly beyond one side of the image, ascending.
 
         The array is overwritten by the next call.
@@ -177,7 +177,7 @@ class Clusters:
             self._near,
         )
         if count < 0:
-            finite_nodes(nodes, None)
+            require_finite_nodes(nodes, None)
             raise MeshError("nodes are so far away that no slice can be cut: check their unit")
         return self._near[:count]
 

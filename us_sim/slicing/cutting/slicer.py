@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SLICERS
 from us_sim.slicing.cutting.resampling import (
-    label_voxels,
-    parallel_rows,
+    get_label_voxels,
+    run_rows_in_parallel,
     sample_labels,
     sample_nearest,
     sample_plane,
@@ -21,7 +21,7 @@ from us_sim.slicing.cutting.section import RestMesh
 from us_sim.slicing.probe.plane import SlicePlane
 
 if TYPE_CHECKING:
-    from us_sim.slicing.cutting.resampling import Located
+    from us_sim.slicing.cutting.resampling import LocatedPixels
     from us_sim.volume.volume import Volume
 
 
@@ -59,7 +59,7 @@ class Slicer(ABC):
         """Prepare everything that all images of the mesh share."""
 
     @abstractmethod
-    def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
+    def cut_image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
         """The B-mode image (rows, columns) with the mesh at ``nodes`` (N, 3) m.
 
         Grey values are trilinear in the undeformed volume.
@@ -69,60 +69,62 @@ class Slicer(ABC):
         """
 
     @abstractmethod
-    def locate(self, nodes: ArrayLike, plane: SlicePlane) -> Located:
+    def locate_pixels(self, nodes: ArrayLike, plane: SlicePlane) -> LocatedPixels:
         """Where each pixel lies in the mesh.
 
         Right after an image of these same two objects the mesh is not cut again, so nodes must not
         be written to in between.
 
         Raises:
-            MeshError: as for `image`.
+            MeshError: as for `cut_image`.
         """
 
-    def locate_some(self, nodes: ArrayLike, plane: SlicePlane, steps: tuple[int, int]) -> Located:
-        """As `locate`, of every so many-th row and column from 0 on."""
-        return self.locate(nodes, plane).some(steps)
+    def locate_pixel_subset(
+        self, nodes: ArrayLike, plane: SlicePlane, steps: tuple[int, int]
+    ) -> LocatedPixels:
+        """As `locate_pixels`, of every so many-th row and column from 0 on."""
+        return self.locate_pixels(nodes, plane).take_every(steps)
 
-    def labels(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
+    def cut_labels(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
         """The label image (rows, columns): the nearest voxel's label, 0 where there is nothing.
 
         Raises:
             VolumeError: the volume has no labels.
-            MeshError: as for `image`.
+            MeshError: as for `cut_image`.
         """
-        label_voxels(self._volume)  # refuses before the work
-        return self.labels_at(self._locate_anew(nodes, plane))
+        get_label_voxels(self._volume)  # refuses before the work
+        return self.sample_located_labels(self._locate_anew(nodes, plane))
 
-    def _locate_anew(self, nodes: ArrayLike, plane: SlicePlane) -> Located:
-        """As `locate`, though nodes may have been written to since an image of them."""
-        return self.locate(np.asarray(nodes).view(), plane)
+    def _locate_anew(self, nodes: ArrayLike, plane: SlicePlane) -> LocatedPixels:
+        """As `locate_pixels`, though nodes may have been written to since an image of them."""
+        return self.locate_pixels(np.asarray(nodes).view(), plane)
 
-    def labels_at(self, located: Located) -> NDArray[np.uint8]:
-        """The label image (rows, columns) of pixels that `locate` has found.
+    def sample_located_labels(self, located: LocatedPixels) -> NDArray[np.uint8]:
+        """The label image (rows, columns) of pixels that `locate_pixels` has found.
 
         Raises:
             VolumeError: the volume has no labels.
         """
-        voxels, shape = label_voxels(self._volume)
+        voxels, shape = get_label_voxels(self._volume)
         elements, maps = located.elements, located.maps
         image = np.empty(elements.shape, dtype=np.uint8)
-        parallel_rows(
+        run_rows_in_parallel(
             self._threads,
             len(elements),
             lambda a, b: sample_nearest(voxels, shape, maps, elements, a, b, image),
         )
         return image
 
-    def rest_coordinates(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.float64]:
+    def compute_rest_coordinates(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.float64]:
         """Where each pixel's tissue lies at rest: (rows, columns, 3) m, frame ``patient``.
 
         Outside the mesh that is the pixel itself; NaN where tissue moved away, and outside spans.
 
         Raises:
-            MeshError: as for `image`.
+            MeshError: as for `cut_image`.
         """
         to_patient = self._volume.index_to_patient
-        index = self._locate_anew(nodes, plane).rest_index()
+        index = self._locate_anew(nodes, plane).compute_rest_index()
         return np.asarray(index @ to_patient[:3, :3].T + to_patient[:3, 3])
 
 
@@ -157,10 +159,10 @@ def warm_up(name: str, threads: int = 1) -> None:
     volume = Volume(voxels, np.eye(4), voxels, {0: "nothing"})
     nodes = np.array([[0.0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 0], [0, 0, 1e-3]]) - 2e-4
     slicer = create_slicer(name, volume, nodes, np.array([[0, 1, 2, 3]]), threads=threads)
-    plane = LinearProbe(aperture=0.01, depth=0.01, columns=4, rows=4).plane(Pose())
-    slicer.image(1.1 * nodes, plane)
-    slicer.labels(nodes, plane)
-    slicer.locate_some(nodes, plane, (2, 2))
-    slicer.rest_coordinates(nodes, plane)
+    plane = LinearProbe(aperture=0.01, depth=0.01, columns=4, rows=4).make_plane(Pose())
+    slicer.cut_image(1.1 * nodes, plane)
+    slicer.cut_labels(nodes, plane)
+    slicer.locate_pixel_subset(nodes, plane, (2, 2))
+    slicer.compute_rest_coordinates(nodes, plane)
     sample_plane(volume, plane, threads=threads)
     sample_labels(volume, plane, threads=threads)

@@ -128,7 +128,7 @@ def fill_elements(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_some_elements(
+def fill_element_subset(
     spans, used, runs, rigid, black, outlines, points, turns, outline_number, steps, columns,
     elements,
 ):  # fmt: skip
@@ -224,16 +224,16 @@ def _write_clipped(m, shape, row, first, end, x, y, z):
         if inner <= i < outer:
             continue
         if low <= i < high:
-            x[i] = _held(m[0, 0] + m[0, 2] * row + m[0, 1] * i, shape[0])
-            y[i] = _held(m[1, 0] + m[1, 2] * row + m[1, 1] * i, shape[1])
-            z[i] = _held(m[2, 0] + m[2, 2] * row + m[2, 1] * i, shape[2])
+            x[i] = _clamp_index(m[0, 0] + m[0, 2] * row + m[0, 1] * i, shape[0])
+            y[i] = _clamp_index(m[1, 0] + m[1, 2] * row + m[1, 1] * i, shape[1])
+            z[i] = _clamp_index(m[2, 0] + m[2, 2] * row + m[2, 1] * i, shape[2])
         else:
             x[i] = _NOWHERE
             y[i] = z[i] = 0
 
 
 @njit(inline="always", error_model="numpy")
-def _held(index, count):
+def _clamp_index(index, count):
     last = max(count - 1, 0) * _ONE - 1.0
     return np.int32(max(0.0, min(index * _ONE, last)))
 

@@ -5,7 +5,7 @@
 >>> from us_sim.slicing.probe.probe import LinearProbe
 >>> probe = LinearProbe(aperture=0.04, depth=0.05, columns=400, rows=500)
 >>> annotation = Annotation(probe, {5: ("vein", (0.25, 0.4, 0.85))})
->>> annotation.draw(np.zeros((500, 400), np.uint8), badge=Badge("LOST", (230, 40, 40))).shape
+>>> annotation.draw_annotated(np.zeros((500, 400), np.uint8), badge=Badge("LOST", (230, 40, 40))).shape
 (500, 400, 3)
 """
 
@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.slicing.drawing.label_outlines import Refine, label_outlines
-from us_sim.slicing.drawing.overlay import Colour, ColourBar, Label, lettering, mirrored
+from us_sim.slicing.drawing.label_outlines import Refine, trace_label_outlines
+from us_sim.slicing.drawing.overlay import Colour, ColourBar, TextPatch, mirror_line, render_text
 
 if TYPE_CHECKING:
     from us_sim.slicing.drawing.overlay import Overlay
@@ -67,7 +67,7 @@ class Annotation:
             label: (name, _bright(colour)) for label, (name, colour) in structures.items()
         }
         self._ticks: list[NDArray[np.int32]] = []
-        self._labels: list[tuple[Label, int, int]] = []
+        self._labels: list[tuple[TextPatch, int, int]] = []
         self._occupied: list[Box] = []
         self._focus: NDArray[np.int32] | None = None
         matrix = probe.image_to_probe
@@ -76,10 +76,10 @@ class Annotation:
             self._lay_out_focus(round((probe.focus - matrix[2, 3]) / matrix[2, 1]))
         self._lay_out_width(matrix[0, 3], matrix[0, 0])
         if is_flipped:
-            label = lettering("flipped", self._text, _FOCUS)
+            label = render_text("flipped", self._text, _FOCUS)
             self._place(label, self._columns - 6 * self._text - label.width, self._frame)
 
-    def draw(
+    def draw_annotated(
         self,
         pixels: NDArray[np.uint8],
         labels: NDArray[np.uint8] | None = None,
@@ -101,12 +101,12 @@ class Annotation:
         """
         if self.is_flipped:
             pixels = np.ascontiguousarray(pixels[:, ::-1])
-            overlay = None if overlay is None else overlay.flipped()
-            lines = [mirrored(line, self._columns) for line in lines]
+            overlay = None if overlay is None else overlay.flip_horizontally()
+            lines = [mirror_line(line, self._columns) for line in lines]
         picture = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
         bar = None
         if overlay is not None:
-            overlay.lay_over(picture)
+            overlay.blend_into(picture)
             bar = ColourBar(overlay.scale, self._text, overlay.note)
             if overlay.outline is not None:
                 corners = _fine(overlay.outline)
@@ -124,7 +124,7 @@ class Annotation:
             cv2.fillPoly(picture, [self._focus], _FOCUS, cv2.LINE_AA)
             cv2.polylines(picture, [self._focus], True, _SHADOW, 1, cv2.LINE_AA)
         for label, column, row in self._labels:
-            label.draw(picture, column, row)
+            label.draw_at(picture, column, row)
         if badge is not None:
             self._mark(picture, badge)
         return picture
@@ -139,13 +139,13 @@ class Annotation:
             self._ticks.append(np.array([[edge - length, row], [edge, row]], np.int32))
             if labelled:
                 text = f"{1e3 * depth:g}" + (" mm" if depth == 0 else "")
-                label = lettering(text, self._text, _SCALE)
+                label = render_text(text, self._text, _SCALE)
                 lowest = self._rows - self._frame - label.height
                 top = max(self._frame, min(row - label.height // 2, lowest))
                 self._place(label, edge - self._text - 2 - label.width, top)
 
     def _lay_out_width(self, first: float, spacing: float) -> None:
-        widest = lettering(f"-{900 * abs(first):.0f}", self._text, _SCALE).width
+        widest = render_text(f"-{900 * abs(first):.0f}", self._text, _SCALE).width
         if self.is_flipped:
             first = first + (self._columns - 1) * spacing
             spacing = -spacing
@@ -162,7 +162,7 @@ class Annotation:
             length = self._text if labelled else self._text // 2
             self._ticks.append(np.array([[column, edge - length], [column, edge]], np.int32))
             if labelled:
-                label = lettering(f"{1e3 * x:g}", self._text, _SCALE)
+                label = render_text(f"{1e3 * x:g}", self._text, _SCALE)
                 self._place(label, column - label.width // 2, above - 2 - label.height)
 
     def _lay_out_focus(self, row: int) -> None:
@@ -177,7 +177,7 @@ class Annotation:
             [[tip, row], [tip - size, row - size], [tip - size, row + size]], np.int32
         )
 
-    def _place(self, label: Label, column: int, row: int) -> None:
+    def _place(self, label: TextPatch, column: int, row: int) -> None:
         """Draw that label with every picture, if it lies inside and on no other."""
         box = _box(label, column, row)
         if _lies_in(box, self._picture) and not _is_taken(box, self._occupied):
@@ -192,19 +192,21 @@ class Annotation:
         refine: Refine | None,
     ) -> None:
         """Thin outlines of the structures, and the name of each once, at its longest outline."""
-        named: list[tuple[Label, Box]] = []
+        named: list[tuple[TextPatch, Box]] = []
         for number, (name, colour) in self._structures.items():
             smoothing = self._text / 2.5
-            outlines = label_outlines(labels, number, smoothing=smoothing, refine=refine)
+            outlines = trace_label_outlines(labels, number, smoothing=smoothing, refine=refine)
             if not outlines:
                 continue
             if self.is_flipped:
-                outlines = [np.asarray(mirrored(each, self._columns), float) for each in outlines]
+                outlines = [
+                    np.asarray(mirror_line(each, self._columns), float) for each in outlines
+                ]
             chains = [_fine(outline) for outline in outlines]
             cv2.polylines(picture, chains, True, colour, self._line, cv2.LINE_AA, _FINE)
             left, top = np.floor(outlines[0].min(axis=0)).astype(int).tolist()
             right, bottom = np.ceil(outlines[0].max(axis=0)).astype(int).tolist()
-            named.append((lettering(name, self._text, colour), (left, top, right, bottom)))
+            named.append((render_text(name, self._text, colour), (left, top, right, bottom)))
         taken = [*self._occupied, *drawn]
         around = [box for _, box in named]
         for label, outline in named:
@@ -212,10 +214,10 @@ class Annotation:
             free = [box for box in places if not _is_taken(box, taken)]
             clear = [box for box in free if not _is_taken(box, around)]
             for box in clear[:1] or free[:1]:
-                label.draw(picture, box[0], box[1])
+                label.draw_at(picture, box[0], box[1])
                 taken.append(box)
 
-    def _beside(self, label: Label, outline: Box) -> list[Box]:
+    def _beside(self, label: TextPatch, outline: Box) -> list[Box]:
         """Boxes for a name: above the outline, below, right, left, and in its middle."""
         left, top, right, bottom = outline
         column = max(0, min((left + right - label.width) // 2, self._columns - label.width))
@@ -234,8 +236,8 @@ class Annotation:
         """A frame around the picture and the badge's text at its top."""
         width = self._frame
         for height in range(2 * self._text, 5, -1):
-            label = lettering(badge.text, height, badge.colour)
-            if label.draw(picture, (self._columns - label.width) // 2, width):
+            label = render_text(badge.text, height, badge.colour)
+            if label.draw_at(picture, (self._columns - label.width) // 2, width):
                 break
         picture[:width] = picture[-width:] = badge.colour
         picture[:, :width] = picture[:, -width:] = badge.colour
@@ -271,7 +273,7 @@ def _multiples(step: float, lowest: float, highest: float) -> NDArray[np.float64
     return np.arange(first, last + 1) * step + 0.0  # without -0
 
 
-def _box(label: Label, column: int, row: int) -> Box:
+def _box(label: TextPatch, column: int, row: int) -> Box:
     return column, row, column + label.width, row + label.height
 
 

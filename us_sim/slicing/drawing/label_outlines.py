@@ -25,7 +25,7 @@ _MOST = 64  # most outlines of one label; the longest are taken
 _LEAST = 6.0  # pixels that an outline must enclose
 
 
-def label_outlines(
+def trace_label_outlines(
     labels: NDArray[np.uint8],
     label: int,
     *,
@@ -91,7 +91,7 @@ class _Share(NamedTuple):
 _found: WeakKeyDictionary[Volume, dict[int, _Share]] = WeakKeyDictionary()
 
 
-def onto_border(frame: Frame, label: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def snap_to_border(frame: Frame, label: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Move points (P, 2), column and row, that are near a label's border onto it.
 
     Points at the image's sides, and where there is no tissue, stay.

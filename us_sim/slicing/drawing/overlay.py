@@ -5,7 +5,7 @@
 >>> blue_to_red = (0, 0, 255), (255, 0, 0)
 >>> scale = ColourScale("strain", -0.05, 0.05, "%", factor=100.0, colours=blue_to_red)
 >>> grey = np.full((1, 3, 3), 100, np.uint8)
->>> Overlay(np.float32([[-0.05, np.nan, 0.2]]), scale, opacity=1.0).lay_over(grey)
+>>> Overlay(np.float32([[-0.05, np.nan, 0.2]]), scale, opacity=1.0).blend_into(grey)
 >>> grey.tolist()
 [[[0, 0, 255], [100, 100, 100], [255, 0, 0]]]
 """
@@ -27,7 +27,7 @@ _HALO = 2  # width of the halo around letters, px
 
 
 @dataclass(frozen=True, eq=False)
-class Label:
+class TextPatch:
     """Text as a patch to be blended into a picture."""
 
     colours: NDArray[np.uint8]  # (height, width, 3)
@@ -43,7 +43,7 @@ class Label:
         """px."""
         return self.opacity.shape[1]
 
-    def draw(self, picture: NDArray[np.uint8], column: int, row: int) -> bool:
+    def draw_at(self, picture: NDArray[np.uint8], column: int, row: int) -> bool:
         """Blend it into a (rows, columns, 3) picture with its upper left corner there.
 
         Returns:
@@ -58,7 +58,7 @@ class Label:
 
 
 @lru_cache(maxsize=64)
-def lettering(text: str, height: int, colour: Colour) -> Label:
+def render_text(text: str, height: int, colour: Colour) -> TextPatch:
     """``text`` with capital letters about ``height`` px high."""
     letters = _letters(text, height)
     padded = np.pad(letters, _HALO)
@@ -66,7 +66,7 @@ def lettering(text: str, height: int, colour: Colour) -> Label:
     opacity = np.maximum(padded, 0.8 * halo)
     letters = np.divide(padded, opacity, out=np.zeros_like(padded), where=opacity > 0)
     colours = np.rint(letters[:, :, None] * np.array(colour, np.float32)).astype(np.uint8)
-    return Label(colours, opacity)
+    return TextPatch(colours, opacity)
 
 
 def _letters(text: str, height: int) -> NDArray[np.float32]:
@@ -114,14 +114,14 @@ class ColourScale:
         rows = [np.interp(places, np.arange(len(self.colours)), channel) for channel in channels]
         return np.rint(np.stack(rows, axis=1)).astype(np.uint8)
 
-    def levels(self, values: NDArray[np.floating]) -> NDArray[np.uint8]:
+    def find_levels(self, values: NDArray[np.floating]) -> NDArray[np.uint8]:
         """The row of `table` for each value of an array of any shape; any for NaN."""
         scale = np.float32(255.0 / (self.high - self.low))
         levels = (np.asarray(values, dtype=np.float32) - np.float32(self.low)) * scale
         np.nan_to_num(levels, copy=False)
         return np.asarray(np.rint(np.clip(levels, 0.0, 255.0, out=levels), out=levels), np.uint8)
 
-    def text(self, value: float) -> str:
+    def format_value(self, value: float) -> str:
         """A value as it stands at the bar, without the unit."""
         return f"{self.factor * value:.3g}"
 
@@ -144,23 +144,23 @@ class Overlay:
     note: str = ""
     outline: NDArray[np.floating] | None = None
 
-    def flipped(self) -> Overlay:
+    def flip_horizontally(self) -> Overlay:
         """The same with left and right exchanged."""
         outline = self.outline
         if outline is not None:
-            outline = mirrored(outline, self.values.shape[1])
+            outline = mirror_line(outline, self.values.shape[1])
         return replace(self, values=np.ascontiguousarray(self.values[:, ::-1]), outline=outline)
 
-    def lay_over(self, picture: NDArray[np.uint8]) -> None:
+    def blend_into(self, picture: NDArray[np.uint8]) -> None:
         """Blend the colours into a (rows, columns, 3) picture of red, green and blue."""
-        levels = cv2.cvtColor(self.scale.levels(self.values), cv2.COLOR_GRAY2RGB)
+        levels = cv2.cvtColor(self.scale.find_levels(self.values), cv2.COLOR_GRAY2RGB)
         colours = cv2.LUT(levels, self.scale.table[None])
         blended = cv2.addWeighted(colours, self.opacity, picture, 1.0 - self.opacity, 0.0)
         there = np.equal(self.values, self.values).view(np.uint8)  # not NaN
         cv2.copyTo(blended, there, picture)
 
 
-def mirrored(line: NDArray[np.floating], columns: int) -> NDArray[np.floating]:
+def mirror_line(line: NDArray[np.floating], columns: int) -> NDArray[np.floating]:
     """Column and row (N, 2) in an image of so many columns whose left and right are exchanged."""
     return np.column_stack([columns - 1 - line[:, 0], line[:, 1]])
 
@@ -179,9 +179,9 @@ class ColourBar:
 
     def __init__(self, scale: ColourScale, text: int, note: str = "") -> None:
         margin, width, height = text, text, _HEIGHT * text
-        title = lettering(f"{scale.title} {scale.unit}".strip(), text, _TEXT)
+        title = render_text(f"{scale.title} {scale.unit}".strip(), text, _TEXT)
         values = [
-            lettering(scale.text(value), text, _TEXT)
+            render_text(scale.format_value(value), text, _TEXT)
             for value in (scale.high, 0.5 * (scale.low + scale.high), scale.low)
         ]
         top = margin + title.height + text // 2
@@ -192,7 +192,7 @@ class ColourBar:
         ]
         bottom = top + height + text
         if note:
-            written = lettering(note, text, _TEXT)
+            written = render_text(note, text, _TEXT)
             self._labels.append((written, margin, bottom))
             bottom += written.height
         right = max(column + label.width for label, column, _ in self._labels)
@@ -212,4 +212,4 @@ class ColourBar:
             corners = (column - 1, row - 1), (column + width, row + height)
             cv2.rectangle(picture, *corners, _TEXT, 1)
         for label, left, top in self._labels:
-            label.draw(picture, left, top)
+            label.draw_at(picture, left, top)

@@ -16,7 +16,7 @@ from us_sim.slicing.probe.probe import Probe
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 
-class Window:
+class PixelWindow:
     """Places in an image, and the directions of the beams there.
 
     Args:
@@ -57,7 +57,7 @@ class Blood:
         self._frame: Frame | None = None
         self._mesh: Mesh | None = None
 
-    def at(self, frame: Frame) -> Blood:
+    def advance_to_frame(self, frame: Frame) -> Blood:
         """The same, gone on to a frame, once for all that ask.
 
         Raises:
@@ -67,28 +67,28 @@ class Blood:
             if frame.mesh is not self._mesh:
                 mesh = None if frame.mesh is None else TetrahedralMesh(*frame.mesh)
                 for vessel in self.vessels:
-                    vessel.carried_by(mesh)
+                    vessel.attach_mesh(mesh)
                 self._mesh = frame.mesh
             for vessel in self.vessels:
-                vessel.advance(frame.time, frame.nodes)
+                vessel.advance_to(frame.time, frame.nodes)
             self._frame = frame
         return self
 
-    def velocity(self, frame: Frame, window: Window) -> NDArray[np.float32]:
+    def compute_velocity(self, frame: Frame, window: PixelWindow) -> NDArray[np.float32]:
         """m/s along the beams towards the probe, as ``window`` has places; NaN outside lumens."""
-        factors = [float(vessel.pulse(frame.time)) for vessel in self.vessels]
-        return self._velocity(frame, window, factors)[0]
+        factors = [float(vessel.evaluate_pulse(frame.time)) for vessel in self.vessels]
+        return self._compute_velocity(frame, window, factors)[0]
 
-    def mean_velocities(
-        self, frame: Frame, window: Window
+    def compute_mean_velocities(
+        self, frame: Frame, window: PixelWindow
     ) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
         """Likewise averaged over the pulse, and which vessel each place is in, -1 for none."""
-        return self._velocity(frame, window, [1.0] * len(self.vessels))
+        return self._compute_velocity(frame, window, [1.0] * len(self.vessels))
 
-    def _velocity(
-        self, frame: Frame, window: Window, factors: Sequence[float]
+    def _compute_velocity(
+        self, frame: Frame, window: PixelWindow, factors: Sequence[float]
     ) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
-        self.at(frame)
+        self.advance_to_frame(frame)
         located = frame.placed
         velocity = np.full(len(window.pixel), np.nan, dtype=np.float32)
         which = np.full(len(window.pixel), -1, dtype=np.int8)
@@ -134,12 +134,12 @@ def _find_velocity(
         if not (0.0 <= v <= last_j + 1 and 0.0 <= w <= last_k + 1):
             continue
         i, j, k = min(np.int64(u), last_i), min(np.int64(v), last_j), min(np.int64(w), last_k)
-        across = _blended(offset[..., 0], i, j, k, u - i, v - j, w - k)
-        down = _blended(offset[..., 1], i, j, k, u - i, v - j, w - k)
+        across = _interpolate(offset[..., 0], i, j, k, u - i, v - j, w - k)
+        down = _interpolate(offset[..., 1], i, j, k, u - i, v - j, w - k)
         r = across * across + down * down
         if not r < 1.0:
             continue
-        s = _blended(station, i, j, k, u - i, v - j, w - k)
+        s = _interpolate(station, i, j, k, u - i, v - j, w - k)
         at = np.int64(min(s, np.float64(most)))
         part = s - at
         along_x = axis[at, 0] * (1.0 - part) + axis[at + 1, 0] * part
@@ -149,7 +149,7 @@ def _find_velocity(
 
 
 @njit(inline="always", error_model="numpy")
-def _blended(grid, i, j, k, u, v, w):
+def _interpolate(grid, i, j, k, u, v, w):
     c0 = (grid[i, j, k] * (1.0 - w) + grid[i, j, k + 1] * w) * (1.0 - v) + (
         grid[i, j + 1, k] * (1.0 - w) + grid[i, j + 1, k + 1] * w
     ) * v
@@ -164,7 +164,7 @@ _STANDING = 1e-3  # m/s on a vessel's axis
 _ACROSS = 0.12  # cosine between beam and flow: 83 degrees
 
 
-class Absence(Enum):
+class FlowAbsence(Enum):
     """Why no flow is seen in a part of the image; nothing where it should be seen."""
 
     NOTHING = ""
@@ -175,9 +175,9 @@ class Absence(Enum):
     TOO_SLOW = "too_slow"  # for the wall filter
 
 
-def absence(
-    blood: Blood, frame: Frame, window: Window, lines: NDArray[np.integer], wall_filter: float
-) -> Absence:
+def explain_absence(
+    blood: Blood, frame: Frame, window: PixelWindow, lines: NDArray[np.integer], wall_filter: float
+) -> FlowAbsence:
     """Why flow cannot be seen at the places of a window.
 
     Args:
@@ -187,13 +187,13 @@ def absence(
     coupling = np.ones(1) if frame.contact is None else frame.contact[0]
     heard = coupling[np.minimum(lines.ravel(), len(coupling) - 1)]
     if heard.max(initial=0.0) < _HEARD:
-        return Absence.NO_CONTACT
-    velocity, which = (each.ravel() for each in blood.mean_velocities(frame, window))
+        return FlowAbsence.NO_CONTACT
+    velocity, which = (each.ravel() for each in blood.compute_mean_velocities(frame, window))
     within = which >= 0
     if not within.any():
-        return Absence.NO_VESSEL
+        return FlowAbsence.NO_VESSEL
     if heard[within].max() < _HEARD:
-        return Absence.NO_CONTACT
+        return FlowAbsence.NO_CONTACT
     cosine = fastest = speed = 0.0
     for number in np.unique(which[within]):
         vessel = blood.vessels[number]
@@ -205,7 +205,7 @@ def absence(
         peak = 0.5 * vessel.settings.peak_velocity / vessel.settings.mean_velocity
         fastest = max(fastest, along * peak)
     if speed < _STANDING:
-        return Absence.NO_FLOW
+        return FlowAbsence.NO_FLOW
     if cosine < _ACROSS:
-        return Absence.ACROSS_FLOW
-    return Absence.TOO_SLOW if fastest < wall_filter else Absence.NOTHING
+        return FlowAbsence.ACROSS_FLOW
+    return FlowAbsence.TOO_SLOW if fastest < wall_filter else FlowAbsence.NOTHING

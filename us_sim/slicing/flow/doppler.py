@@ -30,14 +30,14 @@ from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.drawing.overlay import ColourScale
-from us_sim.slicing.flow.blood import Absence, Blood, Window, absence
+from us_sim.slicing.flow.blood import Blood, FlowAbsence, PixelWindow, explain_absence
 from us_sim.slicing.flow.vessel import Vessel
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.m_mode import SweepPicture
 from us_sim.slicing.probe.beams import (
-    beam_angles,
-    fractions_and_depths,
-    pixels_of,
+    compute_beam_angles,
+    compute_beam_coordinates,
+    convert_to_pixels,
     require_depth,
     require_steering,
 )
@@ -51,7 +51,7 @@ _FIRST, _SECOND = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def uniform(seed, place):
+def draw_uniform(seed, place):
     """A number above 0, and at most 1, for two numbers of type uint64: the same in every run.
 
     By the finaliser of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014).
@@ -65,10 +65,10 @@ def uniform(seed, place):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def normal_pair(seed, place):
+def draw_normal_pair(seed, place):
     """Two independent normal numbers (G. E. P. Box, M. E. Muller, 1958)."""
-    size = np.sqrt(-2.0 * np.log(uniform(seed, place)))
-    angle = 2.0 * np.pi * uniform(seed ^ _SECOND, place)
+    size = np.sqrt(-2.0 * np.log(draw_uniform(seed, place)))
+    angle = 2.0 * np.pi * draw_uniform(seed ^ _SECOND, place)
     return size * np.cos(angle), size * np.sin(angle)
 
 
@@ -125,21 +125,21 @@ class ColourDoppler:
                                    left + (right - left) * back, np.full(_EDGE, left)])  # fmt: skip
         depth = np.concatenate([np.full(_EDGE, top), top + (bottom - top) * ahead,
                                 np.full(_EDGE, bottom), top + (bottom - top) * back])  # fmt: skip
-        return pixels_of(self._probe, fraction + self._lean(depth), depth)
+        return convert_to_pixels(self._probe, fraction + self._lean(depth), depth)
 
-    def truth(self, blood: Blood, frame: Frame) -> NDArray[np.float32]:
+    def compute_true_velocity(self, blood: Blood, frame: Frame) -> NDArray[np.float32]:
         """m/s along the box's beams towards the probe, at all pixels; NaN outside lumens."""
-        return blood.velocity(frame, self._whole)
+        return blood.compute_velocity(frame, self._whole)
 
-    def estimate(self, blood: Blood, frame: Frame) -> NDArray[np.float32]:
+    def estimate_velocity(self, blood: Blood, frame: Frame) -> NDArray[np.float32]:
         """m/s towards the probe (rows, columns) as estimated; NaN where no colour is shown.
 
         Noise is a function of the frame's time and the place.
         """
         settings = self.settings
         turned = np.empty((*self._window.shape, 2), dtype=np.float32)
-        velocity = blood.velocity(frame, self._window)
-        _turn(velocity, settings.nyquist_velocity, settings.wall_filter, turned)
+        velocity = blood.compute_velocity(frame, self._window)
+        _fill_phasors(velocity, settings.nyquist_velocity, settings.wall_filter, turned)
         if frame.contact is not None:
             turned *= frame.contact[0][self._lines][..., None]
         for _ in range(2):  # twice even is a triangle, half as high at its width apart
@@ -159,23 +159,27 @@ class ColourDoppler:
         row, column = self._corner
         rows, columns = self._window.shape
         scale = 1.0 / math.sqrt(settings.pulses)
-        _show(
+        _fill_velocities(
             turned, noise, self._within, settings.nyquist_velocity,
             _SHOWN * 10.0 ** (-settings.gain / 20.0), _BROADENING * scale, _RECEIVER * scale,
             shown[row : row + rows, column : column + columns],
         )  # fmt: skip
         return shown
 
-    def absence(self, blood: Blood, frame: Frame, shown: NDArray[np.float32]) -> Absence:
+    def explain_absence(
+        self, blood: Blood, frame: Frame, shown: NDArray[np.float32]
+    ) -> FlowAbsence:
         """Why an estimate of this frame shows no colour; nothing where it does."""
         if np.count_nonzero(np.isfinite(shown)) > _COLOURED * self._within.sum():
-            return Absence.NOTHING
-        return absence(blood, frame, self._window, self._lines, self.settings.wall_filter)
+            return FlowAbsence.NOTHING
+        return explain_absence(blood, frame, self._window, self._lines, self.settings.wall_filter)
 
     @cached_property
-    def _whole(self) -> Window:
-        fraction, _ = fractions_and_depths(self._probe)
-        return Window(self._probe, beam_angles(self._probe, fraction, self.settings.steering))
+    def _whole(self) -> PixelWindow:
+        fraction, _ = compute_beam_coordinates(self._probe)
+        return PixelWindow(
+            self._probe, compute_beam_angles(self._probe, fraction, self.settings.steering)
+        )
 
     def _lean(self, depth: NDArray[np.float64] | NDArray[np.float32]) -> NDArray[np.float64]:
         """Shift of a steered beam from its place at the box's middle depth, as a fraction."""
@@ -195,7 +199,7 @@ class ColourDoppler:
         return np.clip(np.rint((start + 0.5) * probe.lines - 0.5), 0, probe.lines - 1).astype(int)
 
     def _lay_out(self) -> None:
-        fraction, depth = fractions_and_depths(self._probe)
+        fraction, depth = compute_beam_coordinates(self._probe)
         start = fraction - self._lean(depth)
         with np.errstate(invalid="ignore"):
             within = (start >= self._left) & (start <= self._right)
@@ -207,8 +211,8 @@ class ColourDoppler:
         self._within = np.ascontiguousarray(within[box])
         self._corner = int(rows[0]), int(columns[0])
         self._lines = self._lines_of(fraction[box], depth[box])
-        angles = beam_angles(self._probe, fraction[box], self.settings.steering)
-        self._window = Window(self._probe, angles, corner=self._corner)
+        angles = compute_beam_angles(self._probe, fraction[box], self.settings.steering)
+        self._window = PixelWindow(self._probe, angles, corner=self._corner)
         # Beyond the box nothing is computed, as no beams go there.
         self._window.pixel[~self._within.ravel()] = -1
         cell = self.settings.resolution / self._probe.pixel_spacing
@@ -219,21 +223,21 @@ class ColourDoppler:
 
 
 @njit(inline="always", error_model="numpy")
-def _passed(v, nyquist, wall):
+def _wall_filter_gain(v, nyquist, wall):
     """The part of a velocity's power that the wall filter lets through, whose input is aliased."""
     fast = (v - 2.0 * nyquist * np.round(v / (2.0 * nyquist))) ** 4
     return fast / (fast + wall**4) if fast > 0.0 else 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _turn(velocity, nyquist, wall, turned):
+def _fill_phasors(velocity, nyquist, wall, turned):
     """Fills turned (rows, columns, 2): real and imaginary part of a place's R, without noise."""
     for row in range(velocity.shape[0]):
         for column in range(velocity.shape[1]):
             v = velocity[row, column]
             turned[row, column, 0] = turned[row, column, 1] = 0.0
             if not np.isnan(v):
-                weight = _passed(v, nyquist, wall)
+                weight = _wall_filter_gain(v, nyquist, wall)
                 angle = np.pi * v / nyquist
                 turned[row, column, 0] = weight * np.cos(angle)
                 turned[row, column, 1] = weight * np.sin(angle)
@@ -245,13 +249,13 @@ def _fill_noise(seed, noise):
     for row in range(noise.shape[0]):
         for column in range(noise.shape[1]):
             place = np.uint64(row) * np.uint64(65536) + np.uint64(column)
-            one, other = normal_pair(seed, place)
+            one, other = draw_normal_pair(seed, place)
             noise[row, column, 0] = one * np.sqrt(0.5)
             noise[row, column, 1] = other * np.sqrt(0.5)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _show(turned, noise, within, nyquist, least, broadening, receiver, shown):
+def _fill_velocities(turned, noise, within, nyquist, least, broadening, receiver, shown):
     """Fills shown (rows, columns) with velocities where R with its noise is large enough."""
     for row in range(within.shape[0]):
         for column in range(within.shape[1]):
@@ -290,10 +294,10 @@ class Spectrum:
         require_steering(probe, "spectrum.steering", settings.steering)
         depth = require_depth(probe, "spectrum.depth", settings.depth, "the gate")
         start = np.array([settings.lateral])
-        middle = pixels_of(probe, start, np.array([depth]), settings.steering)[0]
+        middle = convert_to_pixels(probe, start, np.array([depth]), settings.steering)[0]
         if not (-0.5 <= middle[0] <= probe.columns - 0.5 and middle[1] <= probe.rows - 0.5):
             raise ProbeError("spectrum.steering: the gate lies beside the image: steer it less")
-        angle = float(beam_angles(probe, start, settings.steering)[0])
+        angle = float(compute_beam_angles(probe, start, settings.steering)[0])
         along = np.array([math.sin(angle), math.cos(angle)])
         across = np.array([along[1], -along[0]])
         far = settings.size * ((np.arange(_ALONG) + 0.5) / _ALONG - 0.5)
@@ -302,7 +306,7 @@ class Spectrum:
         places = middle + offsets.reshape(-1, 2) / probe.pixel_spacing
         line = round((settings.lateral + 0.5) * probe.lines - 0.5)
         self._line = min(max(line, 0), probe.lines - 1)
-        self._window = Window(probe, np.full(len(places), angle), places)
+        self._window = PixelWindow(probe, np.full(len(places), angle), places)
         self.lines = _gate_lines(middle, along, across, settings, probe)
         nyquist, cosine = settings.nyquist_velocity, math.cos(settings.angle_correction)
         self._lowest = nyquist * (settings.baseline - 1.0)
@@ -312,30 +316,30 @@ class Spectrum:
         )
         self._seen = -math.inf  # s, time of the newest column in which blood is seen
 
-    def go_on(self, before: Spectrum) -> None:
+    def take_over_picture(self, before: Spectrum) -> None:
         """Go on with the picture of a gate that looked elsewhere, if its scales are the same."""
         if before._picture.layout == self._picture.layout:
             self._picture, self._seen = before._picture, before._seen
 
-    def show(self, blood: Blood, frame: Frame) -> NDArray[np.uint8]:
+    def draw_sweep(self, blood: Blood, frame: Frame) -> NDArray[np.uint8]:
         """The picture (rows, columns, 3) up to the frame, with its scales.
 
         Between two frames the tissue is taken to be as in the later one; the pulse is not.
         """
-        moments = self._picture.moments(frame.time)
-        columns, seen = self.columns(blood, frame, moments)
-        self._picture.add(columns)
+        moments = self._picture.advance_to(frame.time)
+        columns, seen = self.compute_columns(blood, frame, moments)
+        self._picture.append_columns(columns)
         self._seen = moments[seen].max(initial=self._seen)
-        return self._picture.drawn()
+        return self._picture.draw_picture()
 
-    def absence(self, blood: Blood, frame: Frame) -> Absence:
+    def explain_absence(self, blood: Blood, frame: Frame) -> FlowAbsence:
         """Why the picture up to this frame shows no blood; nothing where it does."""
         if 0.0 <= frame.time - self._seen < self.settings.sweep:
-            return Absence.NOTHING
+            return FlowAbsence.NOTHING
         lines = np.full(self._window.shape, self._line)
-        return absence(blood, frame, self._window, lines, self.settings.wall_filter)
+        return explain_absence(blood, frame, self._window, lines, self.settings.wall_filter)
 
-    def columns(
+    def compute_columns(
         self, blood: Blood, frame: Frame, moments: NDArray[np.float64]
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """Grey spectra (rows, K) at times (K,) s, the fastest towards the probe on top.
@@ -343,8 +347,8 @@ class Spectrum:
         And (K,) whether blood is seen in them: brighter than black, and than the noise.
         """
         settings = self.settings
-        means, which = blood.mean_velocities(frame, self._window)
-        pulses = np.array([vessel.pulse(moments) for vessel in blood.vessels])
+        means, which = blood.compute_mean_velocities(frame, self._window)
+        pulses = np.array([vessel.evaluate_pulse(moments) for vessel in blood.vessels])
         velocities = means[None] * pulses[which].T  # where there is no vessel the mean is NaN
         power, peak = np.empty((_ROWS, len(moments))), np.empty(len(moments))
         seeds = np.rint(moments * 1e6).astype(np.uint64)
@@ -403,13 +407,13 @@ def _fill_spectra(velocities, nyquist, lowest, wall, heard, seeds, power, peak):
             first = np.int64(np.floor(middle)) - reach
             # The narrowest spectrum has power 1 where it is highest.
             height = heard * nyquist * _LEAST_BROADENING / sigma / places
-            height *= _passed(v, nyquist, wall)
+            height *= _wall_filter_gain(v, nyquist, wall)
             for r in range(first, first + 2 * reach + 2):
                 apart = (r - middle) * per_row / sigma
                 power[r % rows, k] += height * np.exp(-0.5 * apart * apart)
         peak[k] = 0.0
         for r in range(rows):
-            speckle = -np.log(uniform(seeds[k], np.uint64(r)))
+            speckle = -np.log(draw_uniform(seeds[k], np.uint64(r)))
             peak[k] = max(peak[k], power[r, k])
             power[r, k] = (power[r, k] + _NOISE) * speckle
 
@@ -418,13 +422,13 @@ _FOLLOWING_STEP = 6  # pixels from one place that is looked at to the next
 _REACH = 8e-3  # m around the nearest place of a vessel, which may cross the image twice
 
 
-def nearest_vessel(
+def find_nearest_vessel(
     blood: Blood, frame: Frame, lateral: float, depth: float, steering: float = 0.0
 ) -> tuple[float, float] | None:
     """The centre in the image of the lumen nearest to a place; None without any.
 
     Args:
-        lateral, depth: of the place, fraction of the face and m, as of `pixels_of`.
+        lateral, depth: of the place, fraction of the face and m, as of `convert_to_pixels`.
         steering: rad, of beams that lead to places.
     """
     probe = frame.probe
@@ -433,9 +437,9 @@ def nearest_vessel(
         np.arange(0, probe.rows, _FOLLOWING_STEP),
     )
     grid: NDArray[np.float64] = np.stack(np.meshgrid(columns, rows), axis=-1).astype(float)
-    window = Window(probe, np.zeros(grid.shape[:2]), grid)
-    _, which = blood.mean_velocities(frame, window)
-    here = pixels_of(probe, np.array([lateral]), np.array([depth]), steering)[0]
+    window = PixelWindow(probe, np.zeros(grid.shape[:2]), grid)
+    _, which = blood.compute_mean_velocities(frame, window)
+    here = convert_to_pixels(probe, np.array([lateral]), np.array([depth]), steering)[0]
     far = np.linalg.norm((grid - here) * probe.pixel_spacing, axis=-1)
     far[which < 0] = np.inf
     if not np.isfinite(far).any():
@@ -443,7 +447,7 @@ def nearest_vessel(
     nearest = np.unravel_index(np.argmin(far), far.shape)
     beside = np.linalg.norm((grid - grid[nearest]) * probe.pixel_spacing, axis=-1) < _REACH
     column, row = np.rint(grid[beside & (which == which[nearest])].mean(axis=0)).astype(int)
-    fractions, depths = fractions_and_depths(probe)
+    fractions, depths = compute_beam_coordinates(probe)
     across, down = float(fractions[row, column]), float(depths[row, column])
     if isinstance(probe, LinearProbe) and steering != 0.0:
         across -= down * math.tan(steering) / probe.aperture
@@ -462,10 +466,10 @@ def warm_up() -> None:
     mesh = box_mesh([1e-3, 8e-3], [0.0, 0.02, 0.03], [0.0, 8e-3])
     probe = LinearProbe(aperture=8e-3, depth=8e-3, columns=8, rows=8)
     scanner = BMode(volume, probe)
-    scanner.carry(mesh.nodes, mesh.tetrahedra)
+    scanner.attach_mesh(mesh.nodes, mesh.tetrahedra)
     colour = ColourDoppler(probe, ColourSettings(width=1.0))
     spectrum = Spectrum(probe, SpectrumSettings())
     for nodes in (None, mesh.nodes):
-        frame = scanner.frame(Pose(np.array([4e-3, 0.02, 0.0])), nodes, time=1.0)
-        colour.estimate(blood, frame)
-        spectrum.columns(blood, frame, np.array([1.0]))
+        frame = scanner.make_frame(Pose(np.array([4e-3, 0.02, 0.0])), nodes, time=1.0)
+        colour.estimate_velocity(blood, frame)
+        spectrum.compute_columns(blood, frame, np.array([1.0]))

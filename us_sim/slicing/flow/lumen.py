@@ -49,7 +49,7 @@ class Lumen:
         """(S,) m², of the sections."""
         return np.asarray((self.radii**2).mean(axis=1) * math.pi)
 
-    def rings(self, fractions: NDArray[np.float64]) -> NDArray[np.float64]:
+    def compute_rings(self, fractions: NDArray[np.float64]) -> NDArray[np.float64]:
         """(S, F, DIRECTIONS, 3) m: points at F fractions of the wall's distance."""
         return np.asarray(
             self.centres[:, None, None] + fractions[:, None, None] * self._wall[:, None]
@@ -61,7 +61,7 @@ class Lumen:
         around = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
         return self.radii[..., None] * (around @ self.across)
 
-    def locate(
+    def locate_points(
         self, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Place along the stations (P,), and offset (P, 2) across the tube from its middle.
@@ -91,7 +91,7 @@ class Lumen:
         return station, np.stack([x, y], axis=1) / wall[:, None]
 
 
-def lumen_of(lumen: NDArray[np.bool_], index_to_patient: NDArray[np.float64]) -> Lumen:
+def measure_lumen(lumen: NDArray[np.bool_], index_to_patient: NDArray[np.float64]) -> Lumen:
     """The sections of a vessel from the voxels of its lumen.
 
     Where it reaches the edge of the volume it is taken to go on beyond that.
@@ -110,7 +110,7 @@ def lumen_of(lumen: NDArray[np.bool_], index_to_patient: NDArray[np.float64]) ->
     cropped = lumen[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
     placed = index_to_patient.copy()
     placed[:3, 3] += index_to_patient[:3, :3] @ low
-    line = centreline(cropped, placed)
+    line = find_centreline(cropped, placed)
     walls = _Walls(lumen, low, high, index_to_patient, _WIDEST * line.width)
     points = line.points
     for _ in range(_REFINED):
@@ -120,7 +120,7 @@ def lumen_of(lumen: NDArray[np.bool_], index_to_patient: NDArray[np.float64]) ->
         weights = section.radii**2
         moment = np.einsum("sd,sdx->sx", weights, section._wall) * (2.0 / 3.0)
         centroids = section.centres + moment / np.maximum(weights.sum(axis=1), 1e-30)[:, None]
-        points = resampled(centroids, 0.25 * line.width, smoothing=0.5 * line.width)
+        points = resample_curve(centroids, 0.25 * line.width, smoothing=0.5 * line.width)
     tube = _sections(_extended(points, walls, 0.25 * line.width), walls)
     # Without the stations at its ends where it closes.
     wide = np.flatnonzero(tube.areas > 0.5 * np.median(tube.areas))
@@ -274,7 +274,7 @@ class Centreline:
     width: float  # m, diameter of a circle of the tube's mean area
 
 
-def centreline(lumen: NDArray[np.bool_], index_to_patient: NDArray[np.float64]) -> Centreline:
+def find_centreline(lumen: NDArray[np.bool_], index_to_patient: NDArray[np.float64]) -> Centreline:
     """The centre line of the voxels of a lumen.
 
     Args:
@@ -311,10 +311,10 @@ def centreline(lumen: NDArray[np.bool_], index_to_patient: NDArray[np.float64]) 
     )[sizes > 0]
     # The first and last slice are caps around a corner of the vessel's end.
     inner = centres[1:-1]
-    return Centreline(resampled(inner, 0.25 * width, smoothing=0.5 * width), width)
+    return Centreline(resample_curve(inner, 0.25 * width, smoothing=0.5 * width), width)
 
 
-def resampled(
+def resample_curve(
     points: NDArray[np.float64], spacing: float, smoothing: float = 0.0
 ) -> NDArray[np.float64]:
     """(Q, 3) m: a curve (P, 3) smoothed, with points about ``spacing`` apart, evenly.

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from us_sim.cache import kept
+from us_sim.cache import load_or_create
 from us_sim.errors import SceneError, VolumeError
 from us_sim.kernels import njit
-from us_sim.slicing.flow.lumen import DIRECTIONS, Lumen, lumen_of
+from us_sim.slicing.flow.lumen import DIRECTIONS, Lumen, measure_lumen
 from us_sim.slicing.settings import FlowSettings
-from us_sim.tissue.mesh.embedding import locate
+from us_sim.tissue.mesh.embedding import locate_points
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.volume import Volume
 
@@ -31,7 +31,7 @@ _REACH = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
-class LumenNow:
+class DeformedLumen:
     """A lumen at one moment, at its S stations."""
 
     tangents: NDArray[np.float64]  # (S, 3), unit vectors along the vessel
@@ -47,22 +47,22 @@ class CarriedLumen:
     """
 
     def __init__(self, lumen: Lumen, mesh: TetrahedralMesh | None) -> None:
-        points = lumen.rings(_FRACTIONS).reshape(-1, 3)
+        points = lumen.compute_rings(_FRACTIONS).reshape(-1, 3)
         self._points = np.ascontiguousarray(points)
         self._rest_areas = lumen.areas
         self._nodes = np.zeros((len(points), 4), dtype=np.int32)
         self._weights = np.zeros((len(points), 4))
         self._rest_nodes = np.zeros((1, 3))
         if mesh is not None:
-            where = locate(mesh, points)
+            where = locate_points(mesh, points)
             self._nodes = np.ascontiguousarray(mesh.tetrahedra[where.tetrahedra])
             self._weights = where.weights * (where.outside < _REACH)[:, None]
             self._rest_nodes = mesh.nodes
         self._rest_polygons = np.ones((len(lumen.areas), _RINGS))
         self._rest_polygons = self._measured(self._rest_nodes)[1]
-        self.rest = self.carry(self._rest_nodes)
+        self.rest = self.deform_lumen(self._rest_nodes)
 
-    def carry(self, nodes: NDArray[np.float64]) -> LumenNow:
+    def deform_lumen(self, nodes: NDArray[np.float64]) -> DeformedLumen:
         """The lumen with the tissue's nodes at ``nodes`` (N, 3) m."""
         tangents, polygons = self._measured(nodes)
         within = self._rest_areas[:, None] * _FRACTIONS[1:] ** 2
@@ -70,7 +70,7 @@ class CarriedLumen:
         # Between two rings the profile falls evenly with the area at rest.
         profile = 1.0 - 0.5 * (_FRACTIONS[1:] ** 2 + _FRACTIONS[:-1] ** 2)
         between = np.maximum(np.diff(within, axis=1, prepend=0.0), 0.0)
-        return LumenNow(tangents, within[:, -1], between @ profile)
+        return DeformedLumen(tangents, within[:, -1], between @ profile)
 
     def _measured(
         self, nodes: NDArray[np.float64]
@@ -144,11 +144,11 @@ class LumenMap:
     corner: NDArray[np.int64]  # (3,), the volume's voxel that cell (0, 0, 0) is
 
 
-def mapped_lumen(volume: Volume, label: int) -> tuple[Lumen, LumenMap]:
+def load_lumen_map(volume: Volume, label: int) -> tuple[Lumen, LumenMap]:
     """The lumen of a label, and the map of the voxels around it; from the cache if it is there.
 
     Raises:
-        VolumeError: as `lumen_of`.
+        VolumeError: as `measure_lumen`.
     """
     assert volume.labels is not None
     inside = volume.labels == label
@@ -156,10 +156,10 @@ def mapped_lumen(volume: Volume, label: int) -> tuple[Lumen, LumenMap]:
     about.update(repr((_WAY, inside.shape, volume.index_to_patient.tolist())).encode())
 
     def make() -> tuple[Lumen, LumenMap]:
-        lumen = lumen_of(inside, volume.index_to_patient)
+        lumen = measure_lumen(inside, volume.index_to_patient)
         return lumen, _map(lumen, inside, volume.index_to_patient)
 
-    return kept(f"lumen-{about.hexdigest()[:16]}", _pack, _unpack, make)
+    return load_or_create(f"lumen-{about.hexdigest()[:16]}", _pack, _unpack, make)
 
 
 def _map(lumen: Lumen, inside: NDArray[np.bool_], to_patient: NDArray[np.float64]) -> LumenMap:
@@ -167,7 +167,7 @@ def _map(lumen: Lumen, inside: NDArray[np.bool_], to_patient: NDArray[np.float64
     low, high = voxels.min(axis=0) - _MARGIN, voxels.max(axis=0) + _MARGIN + 1
     shape = tuple(high - low)
     index = np.indices(shape).reshape(3, -1).T + low
-    station, offset = lumen.locate(index @ to_patient[:3, :3].T + to_patient[:3, 3])
+    station, offset = lumen.locate_points(index @ to_patient[:3, :3].T + to_patient[:3, 3])
     return LumenMap(
         station.astype(np.float32).reshape(shape),
         np.clip(offset, -_OUTSIDE, _OUTSIDE).astype(np.float32).reshape(*shape, 2),
@@ -213,7 +213,7 @@ class Vessel:
     def __init__(self, name: str, volume: Volume, label: int, settings: FlowSettings) -> None:
         self.name = name
         try:
-            lumen, self.map = mapped_lumen(volume, label)
+            lumen, self.map = load_lumen_map(volume, label)
         except VolumeError as error:
             raise SceneError(f"{name}.flow: the structure {error}: a flow needs a tube") from error
         self._plain = lumen
@@ -221,7 +221,7 @@ class Vessel:
         self._carried = CarriedLumen(lumen, None)
         self._now = self._carried.rest
         self._circulation: Circulation | None = None
-        self.use(settings)
+        self.apply_settings(settings)
 
     @property
     def settings(self) -> FlowSettings:
@@ -238,7 +238,7 @@ class Vessel:
         """(S,) m², of the lumen across the vessel, at its stations in the direction of the flow."""
         return self._now.areas
 
-    def require(self, settings: FlowSettings) -> float:
+    def find_flow_sign(self, settings: FlowSettings) -> float:
         """1 if blood flows from the first station to the last, -1 for the other way.
 
         Raises:
@@ -256,13 +256,13 @@ class Vessel:
             )
         return 1.0 if cosine > 0.0 else -1.0
 
-    def use(self, settings: FlowSettings) -> None:
+    def apply_settings(self, settings: FlowSettings) -> None:
         """Use other settings from now on; blood that has filled up stays.
 
         Raises:
-            SceneError: as `require`.
+            SceneError: as `find_flow_sign`.
         """
-        sign = self.require(settings)
+        sign = self.find_flow_sign(settings)
         self._settings = settings
         self._sign = sign
         self._waveform = Waveform(settings)
@@ -271,23 +271,23 @@ class Vessel:
         self._flow = self._circulation.at_rest
         self._find_axis_velocity()
 
-    def carried_by(self, mesh: TetrahedralMesh | None) -> None:
+    def attach_mesh(self, mesh: TetrahedralMesh | None) -> None:
         """Let this mesh carry the vessel from now on; None lets it stay as it is."""
         self._mesh = mesh
         self._carried = CarriedLumen(self._plain, mesh)
         self._now = self._carried.rest
         self._find_axis_velocity()
 
-    def advance(self, time: float, nodes: NDArray[np.float64] | None) -> None:
+    def advance_to(self, time: float, nodes: NDArray[np.float64] | None) -> None:
         """Go on to a time (s), with the mesh's nodes (N, 3) m there; None: without tissue."""
         self._now = self._carried.rest
         if nodes is not None and self._mesh is not None:
-            self._now = self._carried.carry(nodes)
+            self._now = self._carried.deform_lumen(nodes)
         assert self._circulation is not None
-        self._flow = self._circulation.advance(time, self._now.areas)
+        self._flow = self._circulation.compute_flow(time, self._now.areas)
         self._find_axis_velocity()
 
-    def pulse(self, time: ArrayLike) -> NDArray[np.float64]:
+    def evaluate_pulse(self, time: ArrayLike) -> NDArray[np.float64]:
         """Flow over its average over the pulse, at times (any shape) s."""
         return self._waveform(time)
 
@@ -308,7 +308,7 @@ _SHUT = 1e-3
 and what is left of the flow not to be seen."""
 
 
-def open_fraction(area: NDArray[np.float64], closed_at: float) -> NDArray[np.float64]:
+def compute_open_fraction(area: NDArray[np.float64], closed_at: float) -> NDArray[np.float64]:
     """Open fraction of a lumen, from its area over that at rest and the fraction at closure."""
     return np.asarray(np.maximum(area - closed_at, 0.0) / (1.0 - closed_at))
 
@@ -363,12 +363,12 @@ class Circulation:
         """Pa, in the reservoir before the vessel."""
         return self._pressure
 
-    def advance(self, time: float, areas: NDArray[np.float64]) -> float:
+    def compute_flow(self, time: float, areas: NDArray[np.float64]) -> float:
         """Flow averaged over the pulse, m³/s, at a time (s), with areas (S,) m² since the last.
 
         Where time goes back, as when a recording begins again, the reservoir is as at rest.
         """
-        open_ = open_fraction(areas / self._rest_areas, self._closed_at)
+        open_ = compute_open_fraction(areas / self._rest_areas, self._closed_at)
         conductance = 0.0
         if open_.min() > _SHUT:
             vessel = float((self._resistances / open_**2).sum())

@@ -16,7 +16,7 @@ weaker by the coupling in decibels. Of two echoes at one place the stronger is s
 >>> probe = LinearProbe(aperture=0.04, depth=0.04, columns=8, rows=8, lines=8)
 >>> tissue = np.full((8, 8), 150, dtype=np.uint8)
 >>> air = Reverberation(probe, Imaging(contact=True))
->>> air.shown(tissue, np.full(8, 0.5, np.float32))[7]  # 6 dB less
+>>> air.apply_coupling(tissue, np.full(8, 0.5, np.float32))[7]  # 6 dB less
 array([124, 124, 124, 124, 124, 124, 124, 124], dtype=uint8)
 """
 
@@ -84,7 +84,7 @@ class ContactSurface:
         self.rest_nodes = nodes
         self._triangles = corners
 
-    def contact(
+    def measure_contact(
         self, nodes: ArrayLike, probe: Probe, pose: Pose
     ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
         """How each line meets the surface.
@@ -94,19 +94,19 @@ class ContactSurface:
 
         Returns:
             (lines,) the fraction of an echo's amplitude transmitted: 0 in air, 1 in full contact;
-            and (lines,) m, the gap as `gaps` says.
+            and (lines,) m, the gap as `measure_gaps` says.
 
         Raises:
             MeshError: another number of nodes than at rest.
         """
-        gap, press = self.gaps(nodes, probe, pose)
+        gap, press = self.measure_gaps(nodes, probe, pose)
         near, far = GEL_FILM
         bead = GEL_BEAD * np.maximum(press, 0.0)
         wet = 1.0 - _smooth((gap - bead - near) / (far - near))
         firm = LIGHT_CONTACT + (1.0 - LIGHT_CONTACT) * _smooth(press / FULL_PRESS)
         return np.asarray(wet * firm, dtype=np.float32), gap
 
-    def gaps(
+    def measure_gaps(
         self, nodes: ArrayLike, probe: Probe, pose: Pose
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Gap between face and surface along each line, and how far the face is pressed in there.
@@ -261,9 +261,9 @@ class GelLayer:
         self._margin = float(probe.pixel_spacing[1])
         # With the kernel loaded the first layer is not late.
         image = np.zeros((probe.rows, probe.columns), np.uint8)
-        self.filled(image, np.full(probe.lines, 1e-6), np.ones(probe.lines))
+        self.fill_gap(image, np.full(probe.lines, 1e-6), np.ones(probe.lines))
 
-    def filled(
+    def fill_gap(
         self, image: NDArray[np.uint8], gap: NDArray[np.float64], coupling: NDArray[np.floating]
     ) -> NDArray[np.uint8]:
         """The slice (rows, columns) with the layer filled; the slice itself where there is none.
@@ -347,9 +347,13 @@ class Reverberation:
         self._line = (np.arange(_PLACES) + 0.5) * (probe.lines / _PLACES) - 0.5
         self._reach = _apertures(probe) // 2
         # With the kernels loaded the first line that loses contact is not late.
-        self.shown(np.zeros(self._place.shape, np.uint8), np.zeros(probe.lines, np.float32))
+        self.apply_coupling(
+            np.zeros(self._place.shape, np.uint8), np.zeros(probe.lines, np.float32)
+        )
 
-    def shown(self, image: NDArray[np.uint8], coupling: NDArray[np.float32]) -> NDArray[np.uint8]:
+    def apply_coupling(
+        self, image: NDArray[np.uint8], coupling: NDArray[np.float32]
+    ) -> NDArray[np.uint8]:
         """Echo levels (rows, columns) as lines of this coupling (lines,) show them."""
         if coupling.min() >= 1.0:
             return image

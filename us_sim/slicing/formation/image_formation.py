@@ -9,9 +9,9 @@ and 0 is no echo, which no gain makes visible.
 >>> from us_sim.slicing.settings import Imaging
 >>> slice_ = np.full((4, 4), 100, dtype=np.uint8)
 >>> probe = LinearProbe(aperture=0.04, depth=0.04, columns=4, rows=4)
->>> ImageFormation(probe, Imaging()).form([slice_]) is slice_
+>>> ImageFormation(probe, Imaging()).form_picture([slice_]) is slice_
 True
->>> ImageFormation(probe, Imaging(gain=6.0)).form([slice_])[0]
+>>> ImageFormation(probe, Imaging(gain=6.0)).form_picture([slice_])[0]
 array([126, 126, 126, 126], dtype=uint8)
 """
 
@@ -27,7 +27,12 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
-from us_sim.slicing.probe.beams import beam_width, depth_steps, focus_of, step_depths
+from us_sim.slicing.probe.beams import (
+    compute_beam_width,
+    compute_step_depths,
+    find_depth_steps,
+    get_focus,
+)
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.settings import ECHO_RANGE, Imaging
@@ -55,7 +60,7 @@ class ImageFormation:
         self._gel_layer: GelLayer | None = None
         self._resolution: Resolution | None = None
         self._reverberation: Reverberation | None = None
-        self._grey_levels: GreyLevels | None = None
+        self._grey_levels: GreyMapping | None = None
         if imaging.elevation_planes > 1:
             self._elevation = Elevation(probe, imaging)
         if imaging.lateral_resolution > 0.0 or imaging.axial_resolution > 0.0:
@@ -68,14 +73,14 @@ class ImageFormation:
             self._gel_layer = GelLayer(probe)
             self._reverberation = Reverberation(probe, imaging)
         if imaging.changes_grey_levels:
-            self._grey_levels = GreyLevels(probe, imaging)
+            self._grey_levels = GreyMapping(probe, imaging)
 
     @property
     def needs_contact(self) -> bool:
-        """Whether `form` asks how each line meets the skin."""
+        """Whether `form_picture` asks how each line meets the skin."""
         return self._reverberation is not None
 
-    def planes(self, pose: Pose, plane: SlicePlane | None = None) -> list[SlicePlane]:
+    def make_planes(self, pose: Pose, plane: SlicePlane | None = None) -> list[SlicePlane]:
         """The planes to cut with the probe at ``pose``, from the lowest y of the probe on.
 
         Args:
@@ -84,7 +89,7 @@ class ImageFormation:
         Raises:
             ProbeError: the pose is nowhere near.
         """
-        plane = plane or self._probe.plane(pose)
+        plane = plane or self._probe.make_plane(pose)
         if self._resolution is not None and plane.spans is not None:
             # Beside a fan's edge there is tissue too, which its outer beams see.
             plane = dataclasses.replace(plane, spans=None)
@@ -96,7 +101,7 @@ class ImageFormation:
             for y in self._elevation.offsets
         ]
 
-    def form(
+    def form_picture(
         self,
         images: Sequence[NDArray[np.uint8]],
         coupling: NDArray[np.float32] | None = None,
@@ -113,17 +118,17 @@ class ImageFormation:
         """
         image = images[0]
         if self._elevation is not None:
-            image = self._elevation.average(images)
+            image = self._elevation.average_planes(images)
         if self._gel_layer is not None and coupling is not None and gap is not None:
-            image = self._gel_layer.filled(image, gap, coupling)
+            image = self._gel_layer.fill_gap(image, gap, coupling)
         if heard is not None:
             image = heard(image)
         if self._resolution is not None:
-            image = self._resolution.spread(image)
+            image = self._resolution.spread_echoes(image)
         if self._reverberation is not None and coupling is not None:
-            image = self._reverberation.shown(image, coupling)
+            image = self._reverberation.apply_coupling(image, coupling)
         if self._grey_levels is not None:
-            image = self._grey_levels.shown(image)
+            image = self._grey_levels.map_levels(image)
         return image
 
 
@@ -133,7 +138,7 @@ _SOFT = 0.7  # exponent of the soft map
 _FADE = 17.0  # grey values over which the faintest echoes fade
 
 
-class GreyLevels:
+class GreyMapping:
     """The console's last stage, as one table for each step of depth.
 
     A level of L dB (0 the strongest) is shown as ``255 m(1 + (L + gain + time gain) / range)``,
@@ -148,9 +153,9 @@ class GreyLevels:
         self._steps: NDArray[np.uint16] | None = None
         gain = np.array([imaging.gain])
         if any(imaging.time_gain):
-            self._steps = depth_steps(probe)
+            self._steps = find_depth_steps(probe)
             at = np.linspace(0.0, probe.depth, len(imaging.time_gain))
-            gain = imaging.gain + np.interp(step_depths(probe), at, imaging.time_gain)
+            gain = imaging.gain + np.interp(compute_step_depths(probe), at, imaging.time_gain)
         grey = np.arange(256)
         level = grey / GREYS_PER_DECIBEL - ECHO_RANGE + gain[:, None]  # dB
         ramp = np.clip(1.0 + level / imaging.dynamic_range, 0.0, 1.0)
@@ -162,7 +167,7 @@ class GreyLevels:
         # Halves are rounded up, also where the sum of decibels is a rounding error below one.
         self._tables = np.floor(255.0 * ramp + (0.5 + 1e-9)).astype(np.uint8)
 
-    def shown(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def map_levels(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The grey values (rows, columns) of echo levels (rows, columns)."""
         out = np.empty_like(image)
         if self._steps is None:
@@ -204,16 +209,18 @@ class Elevation:
 
     def __init__(self, probe: Probe, imaging: Imaging) -> None:
         count = imaging.elevation_planes
-        depths = step_depths(probe)
-        sigma = beam_width(depths, imaging.elevation_width, focus_of(probe)) / WIDTH_PER_SIGMA
+        depths = compute_step_depths(probe)
+        sigma = (
+            compute_beam_width(depths, imaging.elevation_width, get_focus(probe)) / WIDTH_PER_SIGMA
+        )
         # The outer planes of binomial weights of this variance; those come near a Gaussian.
         reach = math.sqrt(count - 1) * float(sigma.max())
         self.offsets: NDArray[np.float64] = np.linspace(-reach, reach, count)  # m, along y
         self.weights = _matched_weights(self.offsets, sigma)  # (DEPTH_STEPS, planes)
         fixed = _fixed_point(self.weights)
-        self._weights = np.ascontiguousarray(fixed.T)[:, depth_steps(probe)]
+        self._weights = np.ascontiguousarray(fixed.T)[:, find_depth_steps(probe)]
 
-    def average(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    def average_planes(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
         """The weighted mean (rows, columns) of the images (rows, columns) on the planes."""
         total = np.full(images[0].size, _WHOLE // 2, dtype=np.uint32)
         for image, weights in zip(images, self._weights, strict=True):

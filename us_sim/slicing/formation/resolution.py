@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.kernels import njit
-from us_sim.slicing.probe.beams import beam_width, focus_of
+from us_sim.slicing.probe.beams import compute_beam_width, get_focus
 from us_sim.slicing.probe.probe import LinearProbe, Probe
 from us_sim.slicing.settings import ECHO_RANGE, Imaging
 
@@ -37,7 +37,7 @@ class Resolution:
     """Spreads echoes across and along the beams.
 
     Across them the width is ``lateral_resolution`` at the focus and grows away from it as
-    `beams.beam_width` says; along them it is ``axial_resolution`` at the face and grows by a tenth
+    `beams.compute_beam_width` says; along them it is ``axial_resolution`` at the face and grows by a tenth
     of that each centimetre.
 
     Where beams are parallel, an image's columns and rows serve as lines and samples. A fan is
@@ -54,19 +54,21 @@ class Resolution:
             line_spacing = self._fan.line_spacing
         sample_spacing = probe.depth / samples
         depths = (np.arange(samples) + 0.5) * sample_spacing
-        across = beam_width(depths, imaging.lateral_resolution, focus_of(probe)) / line_spacing
+        across = (
+            compute_beam_width(depths, imaging.lateral_resolution, get_focus(probe)) / line_spacing
+        )
         along = imaging.axial_resolution * (1.0 + _PULSE_GROWTH * depths) / sample_spacing
         self._across = _point_spreads(across, lines - 1)
         self._along = _point_spreads(along, samples - 1)
 
-    def spread(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def spread_echoes(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The image (rows, columns) of echo levels as the probe resolves it."""
-        beams = image if self._fan is None else self._fan.beams(image)
+        beams = image if self._fan is None else self._fan.resample_to_beams(image)
         power = np.empty(beams.shape, dtype=np.float32)
         _spread_across(beams, _POWERS, *self._across, power)
         out = np.empty_like(beams)
         _spread_along(power, *self._along, _LEVELS, out)
-        return out if self._fan is None else self._fan.pixels(out)
+        return out if self._fan is None else self._fan.resample_to_pixels(out)
 
 
 class _Fan:
@@ -110,11 +112,11 @@ class _Fan:
             cv2.CV_16SC2,
         )
 
-    def beams(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def resample_to_beams(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """(samples, lines) of an image (rows, columns)."""
         return _remapped(image, self._to_beams, replicate=True)
 
-    def pixels(self, beams: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def resample_to_pixels(self, beams: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The image (rows, columns) of (samples, lines), black where no beam reaches."""
         return _remapped(beams, self._to_pixels, replicate=False)
 

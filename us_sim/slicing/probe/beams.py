@@ -4,10 +4,10 @@ A place across the array is a fraction: -0.5 at its first end, 0.5 at its other,
 linear array and of the opening angle where beams spread.
 
 >>> import numpy as np
->>> from us_sim.slicing.probe.beams import pixels_of
+>>> from us_sim.slicing.probe.beams import convert_to_pixels
 >>> from us_sim.slicing.probe.probe import LinearProbe
 >>> probe = LinearProbe(aperture=0.04, depth=0.04, columns=80, rows=80)
->>> pixels_of(probe, np.array([0.0, 0.25]), np.full(2, 0.02)).round(6)  # column and row
+>>> convert_to_pixels(probe, np.array([0.0, 0.25]), np.full(2, 0.02)).round(6)  # column and row
 array([[39.5, 39.5],
        [59.5, 39.5]])
 """
@@ -25,12 +25,12 @@ from us_sim.slicing.probe.probe import LinearProbe, Probe
 DEPTH_STEPS = 512  # steps of depth in which tables of what changes with depth are made
 
 
-def focus_of(probe: Probe) -> float:
+def get_focus(probe: Probe) -> float:
     """Depth of the focus along the beams, m; half the image's depth where the probe has none."""
     return 0.5 * probe.depth if probe.focus is None else probe.focus
 
 
-def beam_width(depth: ArrayLike, width: float, focus: float) -> NDArray[Any]:
+def compute_beam_width(depth: ArrayLike, width: float, focus: float) -> NDArray[Any]:
     """Width of a beam at depths (any shape) m, that is ``width`` at its focus.
 
     It grows on both sides as that of a Gaussian beam, here √2 times at the face and at twice the
@@ -39,12 +39,12 @@ def beam_width(depth: ArrayLike, width: float, focus: float) -> NDArray[Any]:
     return np.asarray(width * np.hypot(1.0, (np.asarray(depth) - focus) / focus))
 
 
-def step_depths(probe: Probe) -> NDArray[Any]:
+def compute_step_depths(probe: Probe) -> NDArray[Any]:
     """(`DEPTH_STEPS`,) m: the depth along the beams in the middle of each step."""
     return np.asarray((np.arange(DEPTH_STEPS) + 0.5) * (probe.depth / DEPTH_STEPS))
 
 
-def depth_steps(probe: Probe) -> NDArray[np.uint16]:
+def find_depth_steps(probe: Probe) -> NDArray[np.uint16]:
     """(rows, columns): the step of depth that each pixel lies in; 0 where no beam reaches."""
     step = probe.pixel_beams[1] * np.float32(DEPTH_STEPS / probe.depth)
     np.nan_to_num(step, copy=False)
@@ -77,14 +77,16 @@ def require_steering(probe: Probe, key: str, steering: float) -> None:
         raise ProbeError(f"{key}: is for linear probes only: beams of this one spread, so give 0")
 
 
-def beam_angles(probe: Probe, fraction: NDArray[Any], steering: float = 0.0) -> NDArray[np.float64]:
+def compute_beam_angles(
+    probe: Probe, fraction: NDArray[Any], steering: float = 0.0
+) -> NDArray[np.float64]:
     """Angles (as ``fraction``) rad of the beams there from the probe's z towards its x."""
     directions = probe.beam_directions
     angles = np.arctan2(directions[:, 0], directions[:, 1])
-    return np.asarray(_at(probe, fraction, angles) + steering)
+    return np.asarray(_interpolate_lines(probe, fraction, angles) + steering)
 
 
-def pixels_of(
+def convert_to_pixels(
     probe: Probe, fraction: NDArray[Any], depth: NDArray[Any], steering: float = 0.0
 ) -> NDArray[np.float64]:
     """(P, 2) column and row, with fractions of pixels, of places (P,) along beams.
@@ -94,14 +96,14 @@ def pixels_of(
         depth: m, along the beam.
         steering: rad, of all beams.
     """
-    angle = beam_angles(probe, fraction, steering)
-    x = _at(probe, fraction, probe.beam_starts[:, 0]) + depth * np.sin(angle)
-    z = _at(probe, fraction, probe.beam_starts[:, 1]) + depth * np.cos(angle)
+    angle = compute_beam_angles(probe, fraction, steering)
+    x = _interpolate_lines(probe, fraction, probe.beam_starts[:, 0]) + depth * np.sin(angle)
+    z = _interpolate_lines(probe, fraction, probe.beam_starts[:, 1]) + depth * np.cos(angle)
     matrix = probe.image_to_probe
     return np.stack([(x - matrix[0, 3]) / matrix[0, 0], (z - matrix[2, 3]) / matrix[2, 1]], axis=-1)
 
 
-def fractions_and_depths(probe: Probe) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def compute_beam_coordinates(probe: Probe) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Fraction of the face and depth (m) of each pixel (rows, columns); NaN where no beam reaches.
 
     Beams are not steered.
@@ -110,7 +112,9 @@ def fractions_and_depths(probe: Probe) -> tuple[NDArray[np.float32], NDArray[np.
     return (line + np.float32(0.5)) / np.float32(probe.lines) - np.float32(0.5), depth
 
 
-def _at(probe: Probe, fraction: NDArray[Any], of_lines: NDArray[np.float64]) -> NDArray[Any]:
+def _interpolate_lines(
+    probe: Probe, fraction: NDArray[Any], of_lines: NDArray[np.float64]
+) -> NDArray[Any]:
     """Values of lines, linear between them and on beyond the outermost two."""
     if probe.lines == 1:
         return np.full(np.shape(fraction), of_lines[0])

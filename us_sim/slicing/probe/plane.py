@@ -69,7 +69,7 @@ class SlicePlane:
         inverse = np.linalg.inv(self.basis)
         return np.ascontiguousarray(np.column_stack([inverse, -inverse @ self.origin]))
 
-    def is_shown(self) -> NDArray[np.bool_]:
+    def make_shown_mask(self) -> NDArray[np.bool_]:
         """(rows, columns): which pixels show something."""
         if self.spans is None:
             return np.ones((self.rows, self.columns), dtype=np.bool_)
@@ -77,7 +77,7 @@ class SlicePlane:
         first, end = self.spans[:, :, 0, None], self.spans[:, :, 1, None]
         return np.asarray(((column[:, None] >= first) & (column[:, None] < end)).any(axis=1))
 
-    def pixels(self) -> NDArray[np.float64]:
+    def compute_pixel_positions(self) -> NDArray[np.float64]:
         """(rows, columns, 3) m: the position of every pixel centre."""
         column = np.arange(self.columns)[None, :, None]
         row = np.arange(self.rows)[:, None, None]

@@ -3,7 +3,7 @@
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.slicing.probe.probe import LinearProbe
 >>> probe = LinearProbe(aperture=0.04, depth=0.05, columns=400, rows=500, lines=4)
->>> probe.plane(Pose()).origin * 1e3
+>>> probe.make_plane(Pose()).origin * 1e3
 array([-19.95,   0.  ,   0.05])
 >>> probe.beam_starts * 1e3
 array([[-15.,   0.],
@@ -141,7 +141,9 @@ class Probe(Settings, ABC):
         """
 
     @abstractmethod
-    def rays(self, part: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def compute_rays(
+        self, part: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Start (n, 2) m and unit direction (n, 2), as x and z, of beams, also between the lines.
 
         Args:
@@ -162,7 +164,7 @@ class Probe(Settings, ABC):
     @cached_property
     def pixel_spacing(self) -> NDArray[np.float64]:
         """(2,) m: from one column to the next, and from one row to the next."""
-        return _kept(np.array([self.width / self.columns, self.height / self.rows]))
+        return _make_read_only(np.array([self.width / self.columns, self.height / self.rows]))
 
     @cached_property
     def image_to_probe(self) -> NDArray[np.float64]:
@@ -174,17 +176,17 @@ class Probe(Settings, ABC):
         matrix[2, 1] = axial
         matrix[1, 2] = -1.0  # so that it is a rotation times a scale: x, z and -y
         matrix[:, 3] = (0.5 * lateral - half_width, 0.0, 0.5 * axial + top, 1.0)
-        return _kept(matrix)
+        return _make_read_only(matrix)
 
     @cached_property
     def beam_starts(self) -> NDArray[np.float64]:
         """(lines, 2) m: x and z of each beam on the face."""
-        return _kept(self.rays(self._line_parts)[0])
+        return _make_read_only(self.compute_rays(self._line_parts)[0])
 
     @cached_property
     def beam_directions(self) -> NDArray[np.float64]:
         """(lines, 2): x and z of each beam's unit direction."""
-        return _kept(self.rays(self._line_parts)[1])
+        return _make_read_only(self.compute_rays(self._line_parts)[1])
 
     @cached_property
     def pixel_beams(self) -> NDArray[np.float32]:
@@ -197,7 +199,7 @@ class Probe(Settings, ABC):
             line = part * self.lines - 0.5
             np.copyto(beams[0, band], line, where=reached, casting="same_kind")
             np.copyto(beams[1, band], distance, where=reached, casting="same_kind")
-        return _kept(beams)
+        return _make_read_only(beams)
 
     @cached_property
     def pixel_directions(self) -> NDArray[np.float32]:
@@ -206,9 +208,9 @@ class Probe(Settings, ABC):
         NaN where no beam reaches.
         """
         part = (self.pixel_beams[0].ravel() + 0.5) / self.lines
-        directions = self.rays(part.astype(np.float64))[1]
+        directions = self.compute_rays(part.astype(np.float64))[1]
         directions[np.isnan(part)] = np.nan
-        return _kept(directions.T.reshape(2, self.rows, self.columns).astype(np.float32))
+        return _make_read_only(directions.T.reshape(2, self.rows, self.columns).astype(np.float32))
 
     @cached_property
     def beam_pixels(self) -> NDArray[np.float32]:
@@ -219,9 +221,9 @@ class Probe(Settings, ABC):
         x = self.beam_starts[:, 0] + distance * self.beam_directions[:, 0]
         z = self.beam_starts[:, 1] + distance * self.beam_directions[:, 1]
         pixels = np.stack([(x + half_width) / lateral, (z - top) / axial]) - 0.5
-        return _kept(pixels.astype(np.float32))
+        return _make_read_only(pixels.astype(np.float32))
 
-    def plane(self, pose: Pose) -> SlicePlane:
+    def make_plane(self, pose: Pose) -> SlicePlane:
         """The pixels of the image taken with the probe at ``pose``, in the parent frame."""
         rotation = pose.rotation
         lateral, axial = self.pixel_spacing
@@ -237,7 +239,7 @@ class Probe(Settings, ABC):
     @cached_property
     def _spans(self) -> NDArray[np.int32] | None:
         """(rows, 2, 2): runs of columns of each row that beams reach, None when they reach all."""
-        return _kept(np.concatenate([_runs(reached) for *_, reached in self._bands()]))
+        return _make_read_only(np.concatenate([_runs(reached) for *_, reached in self._bands()]))
 
     def _bands(
         self,
@@ -271,12 +273,12 @@ class Probe(Settings, ABC):
         """
         low, high = self.frequencies
         if low > high:
-            raise self.refused(
+            raise self.make_error(
                 "frequencies", f"{low:g} to {high:g} Hz go down: give the lower one first"
             )
         most = self.greatest_depth
         if self.depth > most:
-            raise self.refused(
+            raise self.make_error(
                 "depth",
                 f"{1e3 * self.depth:g} mm is more than the {1e3 * most:g} mm from which "
                 f"echoes of {low * 1e-6:g} to {high * 1e-6:g} MHz come back (probe.frequencies)",
@@ -284,7 +286,7 @@ class Probe(Settings, ABC):
         try:
             require_pixel_counts(self.columns, self.rows)
         except ProbeError as error:
-            raise self.refused("image", str(error)) from error
+            raise self.make_error("image", str(error)) from error
 
 
 @dataclass(frozen=True)
@@ -319,13 +321,15 @@ class LinearProbe(Probe):
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return tuple(np.broadcast_arrays(x / self.aperture + 0.5, z))  # type: ignore[return-value]
 
-    def rays(self, part: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def compute_rays(
+        self, part: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         starts = np.zeros((len(part), 2))
         starts[:, 0] = (part - 0.5) * self.aperture
         return starts, np.tile([0.0, 1.0], (len(part), 1))
 
 
-def _kept(array: Any) -> Any:
+def _make_read_only(array: Any) -> Any:
     """The array, made read-only, since all callers get the same."""
     array.flags.writeable = False
     return array
@@ -380,7 +384,9 @@ class ConvexProbe(Probe):
         below = z + self.radius
         return np.arctan2(x, below) / self.opening_angle + 0.5, np.hypot(x, below) - self.radius
 
-    def rays(self, part: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def compute_rays(
+        self, part: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         angle = (part - 0.5) * self.opening_angle
         directions = np.column_stack([np.sin(angle), np.cos(angle)])
         return self.radius * (directions - [0.0, 1.0]), directions
@@ -423,7 +429,7 @@ class SectorProbe(Probe):
         super().check()
         used = 2 * self.radius * math.tan(0.5 * self.opening_angle)
         if used > self.aperture * (1 + 1e-9):
-            raise self.refused(
+            raise self.make_error(
                 "aperture",
                 f"{1e3 * self.aperture:g} mm is less than the {1e3 * used:.4g} mm "
                 f"of the face that beams over {math.degrees(self.opening_angle):g} degrees from an "
@@ -442,19 +448,21 @@ class SectorProbe(Probe):
         # Of the distance from the apex only the part beyond the face counts.
         return np.arctan2(x, below) / self.opening_angle + 0.5, np.hypot(x, below) * z / below
 
-    def rays(self, part: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def compute_rays(
+        self, part: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         angle = (part - 0.5) * self.opening_angle
         starts = np.column_stack([self.radius * np.tan(angle), np.zeros_like(angle)])
         return starts, np.column_stack([np.sin(angle), np.cos(angle)])
 
 
-def image_outline(probe: Probe) -> NDArray[np.float64]:
+def compute_image_outline(probe: Probe) -> NDArray[np.float64]:
     """(66, 3) m in frame ``probe``: along the face, then back where the image ends.
 
     So the beam of point k ends at the point 65 - k.
     """
     points = 33
-    starts, directions = probe.rays(np.linspace(0.0, 1.0, points))
+    starts, directions = probe.compute_rays(np.linspace(0.0, 1.0, points))
     ends = starts + probe.depth * directions
     outline = np.zeros((2 * points, 3))
     outline[:, [0, 2]] = np.concatenate([starts, ends[::-1]])

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.probe_gap import GAP_TOLERANCE, push_out
+from us_sim.tissue.contact.probe_gap import GAP_TOLERANCE, measure_gaps
 
 _CLEARANCE = 1e-3
 """A touched node is let go at once when the probe is this far from it and from its rest position,
@@ -63,9 +63,9 @@ class ActiveSet:
         self.normal[:] = 0.0
         self.normal_force[:] = 0.0
 
-    def adopt(self, pose: Pose, displacement: NDArray[np.float64]) -> None:
+    def mark_touching(self, pose: Pose, displacement: NDArray[np.float64]) -> None:
         """Take nodes on the probe's surface as touched; a revision lets go the pulled ones."""
-        gap, self.normal = self._gap(pose, self._rest + displacement)
+        gap, self.normal = self._measure_gaps(pose, self._rest + displacement)
         self.touched = gap < _NEAR
         self.normal_force[:] = 0.0
 
@@ -92,11 +92,11 @@ class ActiveSet:
             changed = bool(self.touched.any())
             self.clear()
             return changed
-        gap, normal = self._gap(pose, self._rest + displacement)
+        gap, normal = self._measure_gaps(pose, self._rest + displacement)
         touched = self.touched & (self.normal_force >= 0) & np.isfinite(gap)
         departed = touched & (gap > _CLEARANCE)
         if moved and departed.any():
-            rest_gap, _ = push_out(self._collider, pose, self._rest[departed], self._spacing)
+            rest_gap, _ = measure_gaps(self._collider, pose, self._rest[departed], self._spacing)
             touched[np.flatnonzero(departed)[rest_gap > _CLEARANCE]] = False
         touched |= gap < -GAP_TOLERANCE
         off = touched & (np.abs(gap) > (_LITTLE_DRIFT if exactly else _DRIFT))
@@ -114,20 +114,20 @@ class ActiveSet:
         """Whether a revision would change nothing."""
         if pose is None:
             return not self.touched.any()
-        gap, _ = self._gap(pose, self._rest + displacement)
+        gap, _ = self._measure_gaps(pose, self._rest + displacement)
         return not (
             (gap < -GAP_TOLERANCE).any()
             or (np.abs(gap[self.touched]) > GAP_TOLERANCE).any()
             or (self.normal_force[self.touched] < 0).any()
         )
 
-    def normal_at(
+    def compute_normals(
         self, pose: Pose | None, displacement: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """(C, 3) directions in which the probe pushes touched nodes where they are; else zero."""
         if pose is None:
             return np.zeros_like(self.normal)
-        _, normal = self._gap(pose, self._rest + displacement)
+        _, normal = self._measure_gaps(pose, self._rest + displacement)
         return np.where(self.touched[:, None], normal, 0.0)
 
     def set_forces(self, force: NDArray[np.float64]) -> None:
@@ -137,7 +137,7 @@ class ActiveSet:
     def _margin(self) -> NDArray[np.float64]:
         return np.where(self.touched, _SKIRT * self._spacing, 0.0)
 
-    def _gap(
+    def _measure_gaps(
         self, pose: Pose, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return push_out(self._collider, pose, points, self._spacing, self._margin())
+        return measure_gaps(self._collider, pose, points, self._spacing, self._margin())

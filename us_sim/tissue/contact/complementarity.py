@@ -9,7 +9,7 @@ cannot cycle (K. G. Murty, Note on a Bard-type scheme for solving the complement
 Opsearch 11, 1974).
 
 >>> delassus = np.array([[2.0, 1.0], [1.0, 2.0]])
->>> unilateral(delassus, np.array([-2.0, 1.0]), np.zeros(2, dtype=bool))
+>>> solve_unilateral(delassus, np.array([-2.0, 1.0]), np.zeros(2, dtype=bool))
 (array([1., 0.]), array([ True, False]))
 """
 
@@ -34,7 +34,7 @@ _SINGLE_PIVOTS = 20  # for each unknown, before relaxation takes over
 _SWEEPS = 2000  # of relaxation
 
 
-def unilateral(
+def solve_unilateral(
     delassus: NDArray[np.float64], gap: NDArray[np.float64], start: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Solve 0 <= push, delassus push + gap >= 0, one of the two zero at each node.
@@ -53,7 +53,7 @@ def unilateral(
     push = np.zeros(len(gap))
     active = np.array(start, dtype=np.bool_)
     if len(gap):
-        pivot(np.ascontiguousarray(delassus), np.ascontiguousarray(gap), push, active)
+        solve_by_pivoting(np.ascontiguousarray(delassus), np.ascontiguousarray(gap), push, active)
     return push, active
 
 
@@ -88,8 +88,8 @@ def solve_active(delassus, rhs, index, count, factor, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def pivot(delassus, gap, push, active):
-    """The pivoting of `unilateral`: fills push (k,), and active (k,), which holds the guess."""
+def solve_by_pivoting(delassus, gap, push, active):
+    """The pivoting of `solve_unilateral`: fills push (k,), and active (k,), which holds the guess."""
     k = len(gap)
     factor = np.empty((k, k))
     solution = np.empty(k)
@@ -206,7 +206,7 @@ def predict_forces(
     loaded = np.flatnonzero(touched)
     delassus, opened = _normal_problem(compliance, near, loaded, normal, gap, held)
     delassus[np.diag_indices(len(near))] += softness[near]
-    push, _ = unilateral(delassus, opened, touched[near] | (gap[near] < 0))
+    push, _ = solve_unilateral(delassus, opened, touched[near] | (gap[near] < 0))
     change = -held
     change[near] += push[:, None] * normal[near]
     return change

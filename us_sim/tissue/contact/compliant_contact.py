@@ -9,7 +9,7 @@ integral equations, J. ACM 12, 1965), so that a few rounds bring the gaps below 
 >>> from us_sim.geometry.collider import Sphere
 >>> springs = np.eye(3) / 50.0  # m/N, one node
 >>> contact = CompliantContact(Sphere(0.03), np.zeros((1, 3)), 0.02, springs)
->>> contact.press(Pose(position=[0.0, 0.0, 0.01])), contact.forces.round(3)  # 10 mm on 50 N/m
+>>> contact.press_at(Pose(position=[0.0, 0.0, 0.01])), contact.forces.round(3)  # 10 mm on 50 N/m
 (True, array([[0. , 0. , 0.5]]))
 """
 
@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
-from us_sim.geometry.collider_distance import rotate, rotate_back
+from us_sim.geometry.collider_distance import rotate_vector, rotate_vector_back
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
-from us_sim.tissue.contact.complementarity import pivot, solve_active
-from us_sim.tissue.contact.probe_gap import only_forward, pushing_gap
+from us_sim.tissue.contact.complementarity import solve_active, solve_by_pivoting
+from us_sim.tissue.contact.probe_gap import pushes_only_forward, pushing_gap
 
 _CLOSED = 1e-9
 """A gap up to this is closed, and so is one of a node this deep in the probe, m."""
@@ -70,7 +70,7 @@ class CompliantContact:
         compliance: NDArray[np.float64],
     ) -> None:
         self._box = collider.offset_box
-        self._forward = only_forward(collider, spacing)
+        self._forward = pushes_only_forward(collider, spacing)
         self._rest = np.ascontiguousarray(rest)
         self._spacing = spacing
         # Read-only always, since numba would compile the kernels again for what was just made.
@@ -88,19 +88,19 @@ class CompliantContact:
         self.near[:] = False
         self.sliding_force = 0.0
 
-    def press(self, pose: Pose) -> bool:
+    def press_at(self, pose: Pose) -> bool:
         """Find the forces of the probe at a pose, starting from the last ones.
 
-        Only nodes near the probe are considered; `overlooked` tells whether that was enough.
+        Only nodes near the probe are considered; `add_overlooked` tells whether that was enough.
 
         Returns:
             Whether all gaps are closed or open as they should be, to a nanometre.
         """
-        gap = self._gaps(pose)
+        gap = self._measure_gaps(pose)
         self.near = (gap < _NEAR * self._spacing) | self.forces.any(axis=1)
         return self.solve(pose)
 
-    def overlooked(self, pose: Pose, displacement: NDArray[np.float64]) -> bool:
+    def add_overlooked(self, pose: Pose, displacement: NDArray[np.float64]) -> bool:
         """Whether nodes that the last press did not consider are in the probe.
 
         Args:
@@ -108,16 +108,16 @@ class CompliantContact:
             displacement: (S, 3) m, of all nodes under the forces found.
         """
         self.displacement[~self.near] = displacement[~self.near]
-        entered = (self._gaps(pose) < -_CLOSED) & ~self.near
+        entered = (self._measure_gaps(pose) < -_CLOSED) & ~self.near
         self.near |= entered
         return bool(entered.any())
 
-    def _gaps(self, pose: Pose) -> NDArray[np.float64]:
+    def _measure_gaps(self, pose: Pose) -> NDArray[np.float64]:
         gap = np.empty(len(self._rest))
         normal = np.empty_like(self._rest)
         skirt = np.where(self.forces.any(axis=1), _SKIRT * self._spacing, 0.0)
         everyone = np.arange(len(self._rest))
-        _gaps_of(
+        _fill_gaps(
             self._box,
             self._forward,
             pose.rotation,
@@ -132,7 +132,7 @@ class CompliantContact:
         return gap
 
     def solve(self, pose: Pose) -> bool:
-        """As `press`, with the nodes that `overlooked` found besides."""
+        """As `press_at`, with the nodes that `add_overlooked` found besides."""
         near = np.flatnonzero(self.near)
         displacement = self.displacement[near]
         forces = self.forces[near]
@@ -169,7 +169,7 @@ def _gather(compliance, near):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _gaps_of(box, forward, rotation, origin, rest, index, displacement, skirt, gap, normal):
+def _fill_gaps(box, forward, rotation, origin, rest, index, displacement, skirt, gap, normal):
     """Fills gap (k,) and normal (k, 3) of the nodes ``index`` of rest, displaced by (k, 3)."""
     r = rotation
     for m in range(len(index)):
@@ -177,10 +177,10 @@ def _gaps_of(box, forward, rotation, origin, rest, index, displacement, skirt, g
         a = rest[i, 0] + displacement[m, 0] - origin[0]
         b = rest[i, 1] + displacement[m, 1] - origin[1]
         c = rest[i, 2] + displacement[m, 2] - origin[2]
-        x, y, z = rotate_back(r, a, b, c)
+        x, y, z = rotate_vector_back(r, a, b, c)
         g, nx, ny, nz = pushing_gap(box, forward, skirt[m], x, y, z)
         gap[m] = g
-        normal[m, 0], normal[m, 1], normal[m, 2] = rotate(r, nx, ny, nz)
+        normal[m, 0], normal[m, 1], normal[m, 2] = rotate_vector(r, nx, ny, nz)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
@@ -206,7 +206,7 @@ def _newton(box, forward, rotation, origin, rest, spacing, compliance, near, dis
     remembered = 0
     converged, sliding = False, 0.0
     for iteration in range(_ROUNDS):
-        _gaps_of(box, forward, rotation, origin, rest, near, point, skirt, gap, normal)
+        _fill_gaps(box, forward, rotation, origin, rest, near, point, skirt, gap, normal)
         for m in range(k):
             was[m] = active[m]
         _solve_planes(block, point, gap, normal, _AHEAD * spacing, iteration == 0, active, forces)
@@ -221,7 +221,7 @@ def _newton(box, forward, rotation, origin, rest, spacing, compliance, near, dis
         for m in range(k):
             for axis in range(3):
                 step[m, axis] = displacement[m, axis] - point[m, axis]
-        _gaps_of(box, forward, rotation, origin, rest, near, displacement, skirt, gap, normal)
+        _fill_gaps(box, forward, rotation, origin, rest, near, displacement, skirt, gap, normal)
         converged, sliding = _check(gap, normal, active, forces)
         if converged or iteration == _ROUNDS - 1:
             break
@@ -270,7 +270,7 @@ def _solve_planes(block, point, gap, normal, limit, first, active, forces):
             delassus[p, q] = value
             delassus[q, p] = value
     if count > 0:
-        pivot(delassus, offset, push, guess)
+        solve_by_pivoting(delassus, offset, push, guess)
     for m in range(k):
         active[m] = False
         forces[m, 0] = forces[m, 1] = forces[m, 2] = 0.0

@@ -109,9 +109,9 @@ class PenaltyContact:
         self._relief = np.zeros(count)  # (P,) m
         self._measure(np.full(count, np.inf))
 
-    def depth(self, pose: Pose, positions: NDArray[np.float64]) -> float:
+    def measure_depth(self, pose: Pose, positions: NDArray[np.float64]) -> float:
         """How deep (m) a probe would be in points (P, 3) m, at least 0."""
-        gap, _ = self.probe.distance(pose, positions)
+        gap, _ = self.probe.measure_distances(pose, positions)
         return max(0.0, -float(gap.min(initial=np.inf)))
 
     def set_pose(self, pose: Pose, positions: NDArray[np.float64]) -> None:
@@ -122,14 +122,14 @@ class PenaltyContact:
         `drop_planes`, ends that.
         """
         last, self._pose = self._pose, pose
-        gap, self.normal = self.probe.distance(pose, positions)
+        gap, self.normal = self.probe.measure_distances(pose, positions)
         self.near = np.flatnonzero(gap < self.probe.reach)
         self._planar = np.flatnonzero(gap < -self.probe.deep)
         if len(self._planar):
             if last is not None and math.dist(last.position, pose.position) > _LEAP:
                 last = None
             inside = positions[self._planar]
-            gap[self._planar], normal = self.probe.entered(last, pose, inside)
+            gap[self._planar], normal = self.probe.find_entry_planes(last, pose, inside)
             self.normal[self._planar] = normal
             self._height = np.einsum("ij,ij->i", inside, normal) - gap[self._planar]
         self._measure(gap)
@@ -145,7 +145,7 @@ class PenaltyContact:
         if self._pose is None:
             return False
         planar, before = len(self._planar), self.normal_force
-        gap, _ = self.probe.distance(self._pose, positions)
+        gap, _ = self.probe.measure_distances(self._pose, positions)
         self._planar = self._planar[:0]
         self.near = np.flatnonzero(gap < self.probe.reach)
         self.update_gaps(positions)
@@ -174,7 +174,7 @@ class PenaltyContact:
         """Update gaps, normals and forces at other positions (P, 3) m."""
         if self._pose is None:
             return
-        gap, normal = self.probe.distance(self._pose, positions, self.near)
+        gap, normal = self.probe.measure_distances(self._pose, positions, self.near)
         if len(planar := self._planar):
             normal[planar] = self.normal[planar]
             gap[planar] = np.einsum("ij,ij->i", positions[planar], normal[planar]) - self._height
@@ -248,7 +248,7 @@ class PenaltyContact:
         """
         return float(_work(self.near, self.gap, self.normal, start, change, length, *self._law))
 
-    def length_along(
+    def find_best_length(
         self,
         start: NDArray[np.float64],
         change: NDArray[np.float64],

@@ -2,11 +2,11 @@
 
 >>> from us_sim.geometry.collider import RoundedBox, Sphere
 >>> pressed = Pose(position=[0.0, 0.0, 0.01])
->>> gap, normal = push_out(Sphere(0.03), pressed, np.zeros((1, 3)), spacing=0.01)
+>>> gap, normal = measure_gaps(Sphere(0.03), pressed, np.zeros((1, 3)), spacing=0.01)
 >>> gap.round(3), normal
 (array([-0.01]), array([[0., 0., 1.]]))
 >>> probe = FlaredProbe(RoundedBox(0.04, 0.014, 0.03, 0.004), spacing=0.006)
->>> gap, normal = probe.distance(Pose(), np.array([[0.0, 0.0, -0.001], [0.022, 0.0, -0.005]]))
+>>> gap, normal = probe.measure_distances(Pose(), np.array([[0.0, 0.0, -0.001], [0.022, 0.0, -0.005]]))
 >>> gap.round(6), normal.round(3)
 (array([-0.001   ,  0.000696]), array([[0.   , 0.   , 1.   ],
        [0.866, 0.   , 0.5  ]]))
@@ -20,7 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
-from us_sim.geometry.collider_distance import curved_box_distance, rotate, rotate_back
+from us_sim.geometry.collider_distance import (
+    measure_curved_box_distance,
+    rotate_vector,
+    rotate_vector_back,
+)
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 
@@ -45,7 +49,7 @@ _CLOSE = 1e-6  # m, from the surface, where a point that is traced to it has arr
 _TRACED = 400  # steps on a point's way in; a grazing one takes many
 
 
-def only_forward(collider: Collider, spacing: float) -> bool:
+def pushes_only_forward(collider: Collider, spacing: float) -> bool:
     """Whether the collider pushes with its face alone, not along the normals of its rounding.
 
     Surface nodes that are ``spacing`` (m) apart do not see a rounding of less than twice that: one
@@ -55,7 +59,7 @@ def only_forward(collider: Collider, spacing: float) -> bool:
     return bool(collider.offset_box[3] < _RESOLVED * spacing)
 
 
-def push_out(
+def measure_gaps(
     collider: Collider,
     pose: Pose,
     points: NDArray[np.float64],
@@ -64,7 +68,7 @@ def push_out(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Gap between points and the probe, along the direction in which it pushes them.
 
-    With a rounding that the points resolve (see `only_forward`) the gap outside the collider and
+    With a rounding that the points resolve (see `pushes_only_forward`) the gap outside the collider and
     within half its rounding below the surface is the signed distance, and the direction its normal.
     Deeper, the nearest surface point is no guide: the normal may point sideways or back. There a
     point is pushed onto the tangent plane where the probe's +z through it leaves the collider, as
@@ -88,7 +92,7 @@ def push_out(
     normal = np.empty_like(points)
     _pushing_gaps(
         collider.offset_box,
-        only_forward(collider, spacing),
+        pushes_only_forward(collider, spacing),
         pose.rotation,
         np.array(pose.position),
         points,
@@ -128,7 +132,7 @@ def wrench_on_probe(
 def pushing_gap(box, forward, skirt, x, y, z):
     """Gap and push direction for one point of frame ``probe``: (gap, nx, ny, nz).
 
-    ``box`` is the collider's ``offset_box``, ``forward`` as `only_forward` says, and ``skirt`` (m)
+    ``box`` is the collider's ``offset_box``, ``forward`` as `pushes_only_forward` says, and ``skirt`` (m)
     widens a forward push beyond the rim.
     """
     if len(box) > 4:
@@ -169,7 +173,7 @@ def _curved_pushing_gap(box, forward, skirt, x, y, z):
         if beside >= (rounding + skirt) ** 2 or behind >= 0.0:
             return math.inf, 0.0, 0.0, 1.0
     else:
-        distance, nx, ny, nz = curved_box_distance(box, _GRIP, x, y, z)
+        distance, nx, ny, nz = measure_curved_box_distance(box, _GRIP, x, y, z)
         if distance >= 0.0 or (distance > -0.5 * rounding and nz >= 0.0):
             return distance, nx, ny, nz
     # Where +z through the point leaves the collider: on the bent face, or on the rounding beyond
@@ -200,10 +204,10 @@ def _pushing_gaps(box, forward, rotation, origin, points, skirt, gap, normal):
         a = points[i, 0] - origin[0]
         b = points[i, 1] - origin[1]
         c = points[i, 2] - origin[2]
-        x, y, z = rotate_back(r, a, b, c)
+        x, y, z = rotate_vector_back(r, a, b, c)
         g, nx, ny, nz = pushing_gap(box, forward, skirt[i], x, y, z)
         gap[i] = g
-        normal[i, 0], normal[i, 1], normal[i, 2] = rotate(r, nx, ny, nz)
+        normal[i, 0], normal[i, 1], normal[i, 2] = rotate_vector(r, nx, ny, nz)
 
 
 class FlaredProbe:
@@ -239,7 +243,7 @@ class FlaredProbe:
         #: m, gap up to which a point may come to touch while the probe stays where it is.
         self.reach = self.deep + spacing
 
-    def distance(
+    def measure_distances(
         self, pose: Pose, points: NDArray[np.float64], near: NDArray[np.integer] | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Signed distance of points, and the outward normal of the surface there.
@@ -264,7 +268,7 @@ class FlaredProbe:
         _curvatures(self._shape, pose.rotation, np.array(pose.position), points, turn)
         return turn
 
-    def entered(
+    def find_entry_planes(
         self, last: Pose | None, pose: Pose, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The planes through which points came in as the probe moved from one pose to another.
@@ -362,9 +366,9 @@ def _distances(shape, r, origin, points, near, gap, normal):
         a = points[i, 0] - origin[0]
         b = points[i, 1] - origin[1]
         c = points[i, 2] - origin[2]
-        x, y, z = rotate_back(r, a, b, c)
+        x, y, z = rotate_vector_back(r, a, b, c)
         gap[i], nx, ny, nz = _distance(shape, x, y, z)
-        normal[i, 0], normal[i, 1], normal[i, 2] = rotate(r, nx, ny, nz)
+        normal[i, 0], normal[i, 1], normal[i, 2] = rotate_vector(r, nx, ny, nz)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -7,10 +7,10 @@ answer is the compliance between the touched nodes; so the tangent is one small 
 >>> import numpy as np
 >>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.contact.stiffness import contact_stiffness
+>>> from us_sim.tissue.contact.stiffness import compute_contact_stiffness
 >>> springs = np.eye(3) / 50.0  # m/N, one node
 >>> pressed, force = Pose(position=[0.0, 0.0, 0.01]), np.array([[0.0, 0.0, 0.5]])
->>> stiffness = contact_stiffness(Sphere(0.03), pressed, [[0.0, 0.0, 0.01]], force, springs, 0.02)
+>>> stiffness = compute_contact_stiffness(Sphere(0.03), pressed, [[0.0, 0.0, 0.01]], force, springs, 0.02)
 >>> float(stiffness[2, 2].round(6))  # N/m
 50.0
 """
@@ -25,12 +25,12 @@ from threadpoolctl import ThreadpoolController
 
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.probe_gap import push_out
+from us_sim.tissue.contact.probe_gap import measure_gaps
 
 _STEP = 1e-7  # m, of the differences by which gaps and normals are differentiated
 
 
-def contact_stiffness(
+def compute_contact_stiffness(
     collider: Collider,
     pose: Pose,
     points: ArrayLike,
@@ -112,7 +112,7 @@ def _surface(
     count = len(points)
     offsets = np.concatenate([np.zeros((1, 3)), _STEP * np.eye(3), -_STEP * np.eye(3)])
     around = (points[:, None] + offsets).reshape(-1, 3)
-    gap, normal = push_out(collider, pose, around, spacing, np.full(len(around), spacing))
+    gap, normal = measure_gaps(collider, pose, around, spacing, np.full(len(around), spacing))
     gap, normal = gap.reshape(count, 7), normal.reshape(count, 7, 3)
     slope = (gap[:, 1:4] - gap[:, 4:7]) / (2 * _STEP)
     turn = (normal[:, 1:4] - normal[:, 4:7]).transpose(0, 2, 1) / (2 * _STEP)

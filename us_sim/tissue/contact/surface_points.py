@@ -5,11 +5,11 @@ probe can touch, but no triangle's, is a point by itself.
 
 >>> from us_sim.tissue.model import TissueModel
 >>> points = SurfacePoints(TissueModel.block((0.1, 0.1, 0.1), (2, 2, 2)), size=0.08)
->>> len(points.rest), float(points.spread(np.ones(8)).sum())  # of the top's four nodes
+>>> len(points.rest), float(points.spread_to_points(np.ones(8)).sum())  # of the top's four nodes
 (12, 4.0)
 >>> sunk = np.zeros((3, 8))
 >>> sunk[2] = 0.01
->>> points.moved(sunk)[0]
+>>> points.interpolate_field(sunk)[0]
 array([0.  , 0.  , 0.01])
 """
 
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.geometry.triangles import TriangleParts, part_size
+from us_sim.geometry.triangles import TriangleParts, choose_part_size
 from us_sim.kernels import njit
 from us_sim.tissue.contact.penalty_contact import PenaltyContact
 from us_sim.tissue.contact.probe_gap import FlaredProbe
@@ -55,13 +55,17 @@ _GREATEST_FORCE = 25.0
 tetrahedron resists, so that no probe turns one inside out."""
 
 
-def surface_contact(model: TissueModel) -> tuple[SurfacePoints, PenaltyContact]:
+def make_surface_contact(model: TissueModel) -> tuple[SurfacePoints, PenaltyContact]:
     """Points on the surface of a tissue, and the contact of its probe at these."""
     # A lone node has no neighbour to be apart from.
     spacing = model.contact_spacing or float(np.ptp(model.mesh.nodes, axis=0).min())
-    points = SurfacePoints(model, part_size(float(model.collider.offset_box[3]), spacing))
-    stiffness = _FIRMNESS * points.spread(nodal_shear_stiffness(model.mesh, model.materials))
-    greatest = _GREATEST_FORCE * points.spread(barrier_strength(model.mesh, model.materials))
+    points = SurfacePoints(model, choose_part_size(float(model.collider.offset_box[3]), spacing))
+    stiffness = _FIRMNESS * points.spread_to_points(
+        nodal_shear_stiffness(model.mesh, model.materials)
+    )
+    greatest = _GREATEST_FORCE * points.spread_to_points(
+        barrier_strength(model.mesh, model.materials)
+    )
     probe = FlaredProbe(model.collider, spacing)
     law = (probe, stiffness, greatest, _STIFFENING * spacing)
     triangles = points.corners, points.weights
@@ -111,15 +115,15 @@ class SurfacePoints:
         self._corner = corner.reshape(self.nodes.shape)  # (P, 3), their places in _own
         self._movable = ~model.fixed[self._own]
         self._all = np.arange(len(self.nodes))
-        total = self.at_nodes(self._area)
+        total = self.sum_at_nodes(self._area)
         self._per_area = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0.0)
 
-    def spread(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def spread_to_points(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """(P,), values of nodes (N,) handed to their points by area; the sum is the same."""
         density = (self.weights * (values * self._per_area)[self.nodes]).sum(axis=1)
         return np.asarray(self._area * density)
 
-    def at_nodes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def sum_at_nodes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, ...), values of points (P, ...) handed to their nodes by weight."""
         total = np.zeros((self._count, *values.shape[1:]))
         for k in range(3):
@@ -127,7 +131,7 @@ class SurfacePoints:
             np.add.at(total, self.nodes[:, k], weight * values)
         return total
 
-    def nodal_springs(
+    def merge_springs(
         self,
         stiffness: NDArray[np.float64],
         gap: NDArray[np.float64],
@@ -156,7 +160,7 @@ class SurfacePoints:
         softness[sprung] = 1.0 / firm[:, 0]
         return gaps, normals, softness
 
-    def moved(
+    def interpolate_field(
         self, field: NDArray[np.float64], some: NDArray[np.integer] | None = None
     ) -> NDArray[np.float64]:
         """(P, 3), a field (3, N) at the points; zero where it is not asked for."""
@@ -165,7 +169,7 @@ class SurfacePoints:
         _add_at_points(some, self.nodes, self.weights, field, values)
         return values
 
-    def placed(
+    def compute_positions(
         self, displacement: NDArray[np.float64], some: NDArray[np.integer] | None = None
     ) -> NDArray[np.float64]:
         """(P, 3) m, where points are at a displacement (3, N) m; at rest where it is not asked."""
@@ -174,13 +178,13 @@ class SurfacePoints:
         _add_at_points(some, self.nodes, self.weights, displacement, places)
         return places
 
-    def add(
+    def add_to_nodes(
         self, vectors: NDArray[np.float64], field: NDArray[np.float64], some: NDArray[np.integer]
     ) -> None:
         """Add vectors (P, 3) of some points to the nodes' field (3, N), by weight."""
         _scatter(some, self.nodes, self.weights, vectors, field)
 
-    def lumped(
+    def lump_springs(
         self,
         active: NDArray[np.integer],
         directions: NDArray[np.float64],

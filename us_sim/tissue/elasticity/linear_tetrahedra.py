@@ -33,7 +33,7 @@ def shape_gradients(mesh: TetrahedralMesh) -> NDArray[np.float64]:
     return gradients
 
 
-def stiffness(mesh: TetrahedralMesh, materials: TissueMaterials) -> bsr_array:
+def assemble_stiffness(mesh: TetrahedralMesh, materials: TissueMaterials) -> bsr_array:
     """(3N, 3N) N/m, symmetric, in 3x3 blocks with sorted columns.
 
     A tetrahedron of volume V couples its nodes a and b by
@@ -42,13 +42,13 @@ def stiffness(mesh: TetrahedralMesh, materials: TissueMaterials) -> bsr_array:
     """
     modulus, ratio = materials.young_modulus, materials.poisson_ratio
     first = modulus * ratio / ((1 + ratio) * (1 - 2 * ratio))
-    return lame_stiffness(mesh, first, modulus / (2 * (1 + ratio)))
+    return assemble_lame_stiffness(mesh, first, modulus / (2 * (1 + ratio)))
 
 
-def lame_stiffness(
+def assemble_lame_stiffness(
     mesh: TetrahedralMesh, first: NDArray[np.float64], second: NDArray[np.float64]
 ) -> bsr_array:
-    """As `stiffness`, of Lame's constants lambda and mu (M,) Pa themselves."""
+    """As `assemble_stiffness`, of Lame's constants lambda and mu (M,) Pa themselves."""
     count = len(mesh.nodes)
     first = first * mesh.volumes
     second = second * mesh.volumes
@@ -74,7 +74,7 @@ def lame_stiffness(
     )
 
 
-def free_stiffness(matrix: bsr_array, fixed: NDArray[np.bool_]) -> bsr_array:
+def drop_fixed_nodes(matrix: bsr_array, fixed: NDArray[np.bool_]) -> bsr_array:
     """The stiffness without the rows and columns of fixed (N,) nodes."""
     rows = np.repeat(np.arange(len(fixed)), np.diff(matrix.indptr))
     kept = ~fixed[rows] & ~fixed[matrix.indices]
@@ -135,14 +135,14 @@ class AveragedPressure:
         scaled = dia_array((1 / self.capacity[None], [0]), shape=2 * self.capacity.shape)
         return (self.element + self.coupling.T @ (scaled @ self.coupling)).tocsr()
 
-    def forces(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+    def compute_forces(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 3, ...) N, external forces that hold the nodes at displacements (N, 3, ...) m."""
         moved = displacement.reshape(3 * len(displacement), -1)
         pressure = (self.coupling @ moved) / self.capacity[:, None]
         held = self.element @ moved + self.coupling.T @ pressure
         return held.reshape(displacement.shape)
 
-    def of(self, nodes: NDArray[np.integer]) -> AveragedPressure:
+    def restrict_to(self, nodes: NDArray[np.integer]) -> AveragedPressure:
         """The equations of some nodes (K,), where the others stay."""
         kept = (3 * nodes[:, None] + np.arange(3)).ravel()
         # Rows of numbers are faster than blocks for many displacements at once.
@@ -150,10 +150,12 @@ class AveragedPressure:
         return replace(self, element=element, coupling=coupling)
 
 
-def averaged_pressure(mesh: TetrahedralMesh, materials: TissueMaterials) -> AveragedPressure:
+def assemble_averaged_pressure(
+    mesh: TetrahedralMesh, materials: TissueMaterials
+) -> AveragedPressure:
     """Assemble the equations of a mesh."""
     split = volumetric_split(materials)
-    element = lame_stiffness(mesh, split.element - split.shear, split.shear)
+    element = assemble_lame_stiffness(mesh, split.element - split.shear, split.shear)
     weight = split.nodal * mesh.volumes / 4
     # A nodal part this small is the rounding of zero: it gets no pressure.
     weight[split.nodal <= 1e-9 * split.element] = 0.0

@@ -20,8 +20,8 @@ factor of two and more. Sources, by kind:
 - nerve: 40 kPa, of the same scene. fluid: of a cyst, a bladder: hardly resists, and is kept in.
 - thrombus: of nobody; so stiff that a vein stays open where it is.
 
->>> from us_sim.tissue.elasticity.material import KINDS, kind_of
->>> kind_of("Left hepatic vein"), KINDS["liver"].young_modulus
+>>> from us_sim.tissue.elasticity.material import KINDS, guess_tissue_kind
+>>> guess_tissue_kind("Left hepatic vein"), KINDS["liver"].young_modulus
 ('vein', 4700.0)
 """
 
@@ -141,7 +141,7 @@ _WORDS = {
 }
 
 
-def kind_of(name: str) -> str:
+def guess_tissue_kind(name: str) -> str:
     """The kind of tissue that a structure's name says: of several known words the last one."""
     words = [word for word in re.split(r"[^a-z]+", name.lower()) if word in _WORDS]
     return _WORDS[words[-1]] if words else next(iter(KINDS))

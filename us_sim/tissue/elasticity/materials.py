@@ -70,7 +70,7 @@ class TissueMaterials:
             )
 
 
-def uniform_material(mesh: TetrahedralMesh, material: Material) -> TissueMaterials:
+def make_uniform_materials(mesh: TetrahedralMesh, material: Material) -> TissueMaterials:
     """The same material everywhere."""
     count = len(mesh.tetrahedra)
     pressure = material.lumen_pressure
@@ -89,7 +89,7 @@ class LabelFractions(NamedTuple):
     labels: NDArray[np.uint8]  # (L,) those that occur, ascending
     fractions: NDArray[np.float64]  # (M, L) of the volume; rows sum to 1
 
-    def of(self, label: int) -> NDArray[np.float64]:
+    def for_label(self, label: int) -> NDArray[np.float64]:
         """(M,) those of one label, zero where it does not occur."""
         return self.fractions[:, self.labels == label].sum(axis=1)
 
@@ -149,7 +149,7 @@ def average_over_labels(
     missing = [int(label) for label in fractions.labels if int(label) not in materials]
     if missing:
         raise MaterialError(
-            f"label {missing[0]} fills {fractions.of(missing[0]).sum():.2f} tetrahedra "
+            f"label {missing[0]} fills {fractions.for_label(missing[0]).sum():.2f} tetrahedra "
             f"but has no material: add one for it"
         )
     constants = np.array(

@@ -21,18 +21,18 @@ from us_sim.errors import SolverError
 from us_sim.kernels import njit
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.materials import TissueMaterials
-from us_sim.tissue.elasticity.neo_hookean_cells import cell_sums
+from us_sim.tissue.elasticity.neo_hookean_cells import make_cell_sums
 from us_sim.tissue.elasticity.neo_hookean_material import (
     INLINED,
     LOOP,
     ONE,
     barrier_term,
-    block,
     bulk_slope,
     cofactor_change,
+    diagonal_block,
     energy_density,
     neo_hookean_constants,
-    stress,
+    piola_stress,
     stress_rise,
     volume_change,
     volume_slope,
@@ -44,19 +44,19 @@ from us_sim.tissue.elasticity.nodal_sums import (
     SHAPE,
     SUMS,
     NodalSums,
-    gather,
     gather_scalar,
+    gather_vector,
+    get_nine,
+    get_three,
     gradient,
-    in_groups,
-    in_lanes,
     lumen_energy_at,
-    nine,
+    pack_groups,
+    pack_lanes,
     put_forces,
     put_nine,
     put_six,
-    scatter,
     scatter_scalar,
-    three,
+    scatter_vector,
 )
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
@@ -98,7 +98,7 @@ def _volume_ratios(displacement, nodes, constants, lanes):
     smallest = np.inf
     inverted = 0
     for chunk in range(len(nodes)):
-        gather(displacement, nodes[chunk], lanes)
+        gather_vector(displacement, nodes[chunk], lanes)
         rows = constants[chunk]
         for w in range(LANES):
             lanes[OUT * LANES + w] = ONE + volume_change(gradient(lanes, rows, w))
@@ -116,7 +116,7 @@ def _volume_ratios(displacement, nodes, constants, lanes):
 def _volume_changes(displacement, nodes, constants, lanes, nodal):
     nodal[:] = 0
     for chunk in range(len(nodes)):
-        gather(displacement, nodes[chunk], lanes)
+        gather_vector(displacement, nodes[chunk], lanes)
         rows = constants[chunk]
         for w in range(LANES):
             h = gradient(lanes, rows, w)
@@ -129,7 +129,7 @@ def _energy_and_forces(displacement, nodal, nodes, constants, lumens, lanes, for
     forces[:, :] = 0
     total = 0.0
     for chunk in range(len(nodes)):
-        gather(displacement, nodes[chunk], lanes)
+        gather_vector(displacement, nodes[chunk], lanes)
         if len(nodal):
             gather_scalar(nodal, nodes[chunk], lanes)
         rows = constants[chunk]
@@ -139,7 +139,10 @@ def _energy_and_forces(displacement, nodal, nodes, constants, lumens, lanes, for
                 h, rows[_SHEAR * LANES + w], rows[_ELEMENT * LANES + w], rows[_WALL * LANES + w]
             )
             put_forces(
-                stress(h, rows[_SHEAR * LANES + w], _pressure(h, lanes, rows, w)), rows, w, lanes
+                piola_stress(h, rows[_SHEAR * LANES + w], _pressure(h, lanes, rows, w)),
+                rows,
+                w,
+                lanes,
             )
         if lumens[0][chunk] >= 0:
             lumen = lumens[1][lumens[0][chunk]]
@@ -148,17 +151,17 @@ def _energy_and_forces(displacement, nodal, nodes, constants, lumens, lanes, for
                 energy, slope, _ = lumen_energy_at(h, lumen, w, _ROW)
                 lanes[_ENERGY * LANES + w] += energy
                 pressure = _pressure(h, lanes, rows, w) + slope
-                put_forces(stress(h, rows[_SHEAR * LANES + w], pressure), rows, w, lanes)
+                put_forces(piola_stress(h, rows[_SHEAR * LANES + w], pressure), rows, w, lanes)
         for w in range(LANES):
             total += lanes[_ENERGY * LANES + w]
-        scatter(lanes, nodes[chunk], forces)
+        scatter_vector(lanes, nodes[chunk], forces)
     return total
 
 
 @njit(**LOOP)
 def _linearise(displacement, nodal, nodes, constants, lumens, lanes, tangent):
     for chunk in range(len(nodes)):
-        gather(displacement, nodes[chunk], lanes)
+        gather_vector(displacement, nodes[chunk], lanes)
         if len(nodal):
             gather_scalar(nodal, nodes[chunk], lanes)
         rows = constants[chunk]
@@ -182,12 +185,12 @@ def _linearise(displacement, nodal, nodes, constants, lumens, lanes, tangent):
 def _volume_slopes(change, nodes, constants, tangent, lanes, nodal):
     nodal[:] = 0
     for chunk in range(len(nodes)):
-        gather(change, nodes[chunk], lanes)
+        gather_vector(change, nodes[chunk], lanes)
         rows = constants[chunk]
         kept = tangent[chunk]
         for w in range(LANES):
             d = gradient(lanes, rows, w)
-            h = nine(kept, _GRADIENT, w)
+            h = get_nine(kept, _GRADIENT, w)
             lanes[OUT * LANES + w] = rows[_NODAL * LANES + w] * volume_slope(h, d)
         scatter_scalar(lanes, nodes[chunk], nodal)
 
@@ -196,18 +199,18 @@ def _volume_slopes(change, nodes, constants, tangent, lanes, nodal):
 def _tangent_product(change, nodal, nodes, constants, tangent, lanes, product):
     product[:, :] = 0
     for chunk in range(len(nodes)):
-        gather(change, nodes[chunk], lanes)
+        gather_vector(change, nodes[chunk], lanes)
         if len(nodal):
             gather_scalar(nodal, nodes[chunk], lanes)
         rows = constants[chunk]
         kept = tangent[chunk]
         for w in range(LANES):
             d = gradient(lanes, rows, w)
-            h = nine(kept, _GRADIENT, w)
+            h = get_nine(kept, _GRADIENT, w)
             shear, nodal_rise = rows[_SHEAR * LANES + w], _nodal_pressure(lanes, rows, w)
             bulk, k = kept[_BULK * LANES + w], kept[_K * LANES + w]
             put_forces(stress_rise(h, d, shear, bulk, k, nodal_rise), rows, w, lanes)
-        scatter(lanes, nodes[chunk], product)
+        scatter_vector(lanes, nodes[chunk], product)
 
 
 @njit(**LOOP)
@@ -217,16 +220,20 @@ def _diagonal_blocks(nodes, constants, tangent, lanes, blocks):
         rows = constants[chunk]
         kept = tangent[chunk]
         for w in range(LANES):
-            h = nine(kept, _GRADIENT, w)
+            h = get_nine(kept, _GRADIENT, w)
             c = cofactor_change(h)
             shear = rows[_SHEAR * LANES + w]
             bulk = kept[_BULK * LANES + w]
-            x, y, z = three(rows, SHAPE, w), three(rows, SHAPE + 3, w), three(rows, SHAPE + 6, w)
+            x, y, z = (
+                get_three(rows, SHAPE, w),
+                get_three(rows, SHAPE + 3, w),
+                get_three(rows, SHAPE + 6, w),
+            )
             o = (-(x[0] + y[0] + z[0]), -(x[1] + y[1] + z[1]), -(x[2] + y[2] + z[2]))
-            put_six(block(o, c, shear, bulk), lanes, OUT, w)
-            put_six(block(x, c, shear, bulk), lanes, OUT + 6, w)
-            put_six(block(y, c, shear, bulk), lanes, OUT + 12, w)
-            put_six(block(z, c, shear, bulk), lanes, OUT + 18, w)
+            put_six(diagonal_block(o, c, shear, bulk), lanes, OUT, w)
+            put_six(diagonal_block(x, c, shear, bulk), lanes, OUT + 6, w)
+            put_six(diagonal_block(y, c, shear, bulk), lanes, OUT + 12, w)
+            put_six(diagonal_block(z, c, shear, bulk), lanes, OUT + 18, w)
         for corner in range(4):
             at = nodes[chunk, corner * LANES : (corner + 1) * LANES]
             for entry in range(6):
@@ -236,7 +243,7 @@ def _diagonal_blocks(nodes, constants, tangent, lanes, blocks):
                     values[at[w]] += added[w]
 
 
-def tetrahedra_sums(
+def make_tetrahedra_sums(
     mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLike
 ) -> NodalSums:
     """Energies, forces and their slopes of the tetrahedra of any mesh, summed at the nodes."""
@@ -248,7 +255,7 @@ def tetrahedra_sums(
     rows[:, _NODAL] = mesh.volumes * made.nodal / 4
     rows[:, _WALL] = mesh.volumes * made.wall
     # Lanes beyond the last tetrahedron name node 0 and have no stiffness.
-    nodes = in_lanes(mesh.tetrahedra.astype(np.uint32))
+    nodes = pack_lanes(mesh.tetrahedra.astype(np.uint32))
     return NodalSums(
         _volume_ratios,
         _volume_changes,
@@ -258,8 +265,8 @@ def tetrahedra_sums(
         _tangent_product,
         _diagonal_blocks,
         nodes=nodes,
-        constants=in_lanes(rows).astype(dtype),
-        lumens=in_groups(made.lumen_energies(mesh)[:, None], dtype),
+        constants=pack_lanes(rows).astype(dtype),
+        lumens=pack_groups(made.lumen_energies(mesh)[:, None], dtype),
         tangent=np.zeros((len(nodes), _TANGENT * LANES), dtype=dtype),
         lanes=np.zeros(ROWS * LANES, dtype=dtype),
     )
@@ -288,7 +295,7 @@ class NeoHookean:
         if self.dtype not in (np.float32, np.float64):
             raise SolverError(f"the neo-Hookean tissue is in {dtype}: give float32 or float64")
         self.count = len(mesh.nodes)  # N
-        sums = tetrahedra_sums if mesh.planes is None else cell_sums
+        sums = make_tetrahedra_sums if mesh.planes is None else make_cell_sums
         self._sums: NodalSums = sums(mesh, materials, self.dtype)
         weight = neo_hookean_constants(mesh, materials).nodal * mesh.volumes / 4
         total = np.zeros(self.count)
@@ -300,17 +307,19 @@ class NeoHookean:
         self._nodal_blocks = _nodal_blocks(mesh, weight, total).astype(self.dtype)
         self.linearise(np.zeros((3, self.count), dtype=self.dtype))
 
-    def energy(self, displacement: NDArray) -> float:
+    def compute_energy(self, displacement: NDArray) -> float:
         """J, summed in double precision."""
-        return self.energy_and_forces(displacement, np.empty(displacement.shape, self.dtype))
+        return self.compute_energy_and_forces(
+            displacement, np.empty(displacement.shape, self.dtype)
+        )
 
-    def forces(self, displacement: NDArray, out: NDArray | None = None) -> NDArray:
+    def compute_forces(self, displacement: NDArray, out: NDArray | None = None) -> NDArray:
         """(3, N) N, the slope of the energy: external forces that hold the nodes there."""
         out = np.empty(displacement.shape, self.dtype) if out is None else out
-        self.energy_and_forces(displacement, out)
+        self.compute_energy_and_forces(displacement, out)
         return out
 
-    def energy_and_forces(self, displacement: NDArray, out: NDArray) -> float:
+    def compute_energy_and_forces(self, displacement: NDArray, out: NDArray) -> float:
         """The energy, J, and its slope (3, N) N, which overwrites ``out``."""
         self._require(displacement)
         self._require(out)
@@ -364,7 +373,7 @@ class NeoHookean:
         """The smallest J, a tetrahedron's volume over its volume at rest; NaN if any J is NaN."""
         return self._volume_ratios(displacement)[0]
 
-    def inverted(self, displacement: NDArray) -> int:
+    def count_inverted(self, displacement: NDArray) -> int:
         """How many tetrahedra have a J that is not above zero."""
         return self._volume_ratios(displacement)[1]
 

@@ -26,12 +26,12 @@ from us_sim.tissue.elasticity.neo_hookean_material import (
     LOOP,
     ONE,
     barrier_term,
-    block,
     bulk_slope,
     cofactor_change,
+    diagonal_block,
     energy_density,
     neo_hookean_constants,
-    stress,
+    piola_stress,
     stress_rise,
     volume_change,
     volume_slope,
@@ -39,12 +39,12 @@ from us_sim.tissue.elasticity.neo_hookean_material import (
 from us_sim.tissue.elasticity.nodal_sums import (
     LANES,
     NodalSums,
-    five,
-    in_groups,
-    in_lanes,
+    get_five,
+    get_three,
     lumen_energy_at,
+    pack_groups,
+    pack_lanes,
     put_six,
-    three,
 )
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
@@ -119,14 +119,14 @@ def add_field(lanes, grid, first, rows, field):
 @njit(**INLINED)
 def _corners(field, w):
     return (
-        three(field, FIELD, w),
-        three(field, FIELD + 3, w),
-        three(field, FIELD + 6, w),
-        three(field, FIELD + 9, w),
-        three(field, FIELD + 12, w),
-        three(field, FIELD + 15, w),
-        three(field, FIELD + 18, w),
-        three(field, FIELD + 21, w),
+        get_three(field, FIELD, w),
+        get_three(field, FIELD + 3, w),
+        get_three(field, FIELD + 6, w),
+        get_three(field, FIELD + 9, w),
+        get_three(field, FIELD + 12, w),
+        get_three(field, FIELD + 15, w),
+        get_three(field, FIELD + 18, w),
+        get_three(field, FIELD + 21, w),
     )
 
 
@@ -167,7 +167,7 @@ def _middle_gradient(b, c, e, h, g):
 def gradients(field, rows, w):
     """The gradients in the five tetrahedra of a cell."""
     a, b, c, d, e, f, g, h = _corners(field, w)
-    per = three(rows, PER_WIDTH, w)
+    per = get_three(rows, PER_WIDTH, w)
     return (
         _corner_gradient(a, e, a, c, a, b, per),
         _corner_gradient(c, g, e, g, g, h, per),
@@ -214,7 +214,7 @@ def _put_eight(values, lanes, row, step, w):
 @njit(**INLINED)
 def put_forces(p, q, r, s, t, rows, w, lanes):
     """Fill rows OUT + 3 corner + axis with the forces of five stresses times volumes."""
-    g = three(rows, PER_WIDTH, w)
+    g = get_three(rows, PER_WIDTH, w)
     x = _corner_forces(
         p[0], p[1], p[2], q[0], q[1], q[2], r[0], r[1], r[2], s[0], s[1], s[2], t[0], t[1], t[2], g
     )
@@ -304,7 +304,7 @@ def _pressure(h, element, wall, nodal):
 
 @njit(**INLINED)
 def _tetrahedron_stress(h, shear, element, wall, nodal):
-    return stress(h, shear, _pressure(h, element, wall, nodal))
+    return piola_stress(h, shear, _pressure(h, element, wall, nodal))
 
 
 @njit(**INLINED)
@@ -348,7 +348,7 @@ def _volume_changes(displacement, grid, constants, lanes, nodal):
         copy_field(displacement, grid, first, rows, lanes)
         for w in range(LANES):
             p, q, r, s, t = gradients(lanes, rows, w)
-            weight = five(rows, _NODAL, w)
+            weight = get_five(rows, _NODAL, w)
             put_volumes(
                 weight[0] * volume_change(p),
                 weight[1] * volume_change(q),
@@ -380,9 +380,9 @@ def _energy_and_forces(displacement, nodal, grid, constants, lumens, lanes, forc
             add_lumens(lanes, rows, lumen, 1, PRESSURES, lanes)
         for w in range(LANES):
             p, q, r, s, t = gradients(lanes, rows, w)
-            shear = five(rows, _SHEAR, w)
-            element, wall = five(rows, _ELEMENT, w), five(rows, _WALL, w)
-            mean = five(lanes, PRESSURES, w)
+            shear = get_five(rows, _SHEAR, w)
+            element, wall = get_five(rows, _ELEMENT, w), get_five(rows, _WALL, w)
+            mean = get_five(lanes, PRESSURES, w)
             lanes[_ENERGY * LANES + w] = (
                 (
                     energy_density(p, shear[0], element[0], wall[0])
@@ -426,9 +426,9 @@ def _linearise(displacement, nodal, grid, constants, lumens, lanes, tangent):
             add_lumens(kept, rows, lumens[1][lumens[0][chunk]], 1, PRESSURES, lanes)
         for w in range(LANES):
             p, q, r, s, t = gradients(kept, rows, w)
-            shear = five(rows, _SHEAR, w)
-            element, wall = five(rows, _ELEMENT, w), five(rows, _WALL, w)
-            mean = five(lanes, PRESSURES, w)
+            shear = get_five(rows, _SHEAR, w)
+            element, wall = get_five(rows, _ELEMENT, w), get_five(rows, _WALL, w)
+            mean = get_five(lanes, PRESSURES, w)
             k, bulk = _K * LANES + w, _BULK * LANES + w
             kept[k] = _pressure(p, element[0], wall[0], mean[0]) - shear[0]
             kept[k + LANES] = _pressure(q, element[1], wall[1], mean[1]) - shear[1]
@@ -455,7 +455,7 @@ def _volume_slopes(change, grid, constants, tangent, lanes, nodal):
         kept = tangent[chunk]
         for w in range(LANES):
             p, q, r, s, t = gradients(kept, rows, w)
-            weight = five(rows, _NODAL, w)
+            weight = get_five(rows, _NODAL, w)
             dp, dq, dr, ds, dt = gradients(lanes, rows, w)
             put_volumes(
                 weight[0] * volume_slope(p, dp),
@@ -481,9 +481,9 @@ def _tangent_product(change, nodal, grid, constants, tangent, lanes, product):
         kept = tangent[chunk]
         for w in range(LANES):
             p, q, r, s, t = gradients(kept, rows, w)
-            shear = five(rows, _SHEAR, w)
-            bulk, k = five(kept, _BULK, w), five(kept, _K, w)
-            mean = five(lanes, PRESSURES, w)
+            shear = get_five(rows, _SHEAR, w)
+            bulk, k = get_five(kept, _BULK, w), get_five(kept, _K, w)
+            mean = get_five(lanes, PRESSURES, w)
             dp, dq, dr, ds, dt = gradients(lanes, rows, w)
             put_forces(
                 stress_rise(p, dp, shear[0], bulk[0], k[0], mean[0]),
@@ -507,10 +507,10 @@ def _corner_blocks(h, i, j, k, shear, bulk):
     c = cofactor_change(h)
     none = ONE - ONE
     return (
-        block((i, j, k), c, shear, bulk),
-        block((i, none, none), c, shear, bulk),
-        block((none, j, none), c, shear, bulk),
-        block((none, none, k), c, shear, bulk),
+        diagonal_block((i, j, k), c, shear, bulk),
+        diagonal_block((i, none, none), c, shear, bulk),
+        diagonal_block((none, j, none), c, shear, bulk),
+        diagonal_block((none, none, k), c, shear, bulk),
     )
 
 
@@ -522,9 +522,9 @@ def _diagonal_blocks(grid, constants, tangent, lanes, blocks):
         kept = tangent[chunk]
         for w in range(LANES):
             p, q, r, s, t = gradients(kept, rows, w)
-            shear = five(rows, _SHEAR, w)
-            bulk = five(kept, _BULK, w)
-            i, j, k = three(rows, PER_WIDTH, w)
+            shear = get_five(rows, _SHEAR, w)
+            bulk = get_five(kept, _BULK, w)
+            i, j, k = get_three(rows, PER_WIDTH, w)
             p0, px, py, pz = _corner_blocks(p, -i, -j, -k, shear[0], bulk[0])
             q0, qx, qy, qz = _corner_blocks(q, i, j, -k, shear[1], bulk[1])
             r0, rx, ry, rz = _corner_blocks(r, i, -j, k, shear[2], bulk[2])
@@ -532,18 +532,26 @@ def _diagonal_blocks(grid, constants, tangent, lanes, blocks):
             i, j, k = HALF * i, HALF * j, HALF * k
             c = cofactor_change(t)
             put_six(p0, lanes, OUT, w)
-            put_sum(block((-i, -j, k), c, shear[4], bulk[4]), pz, rx, sy, lanes, OUT + 6, w)
-            put_sum(block((-i, j, -k), c, shear[4], bulk[4]), py, qx, sz, lanes, OUT + 12, w)
+            put_sum(
+                diagonal_block((-i, -j, k), c, shear[4], bulk[4]), pz, rx, sy, lanes, OUT + 6, w
+            )
+            put_sum(
+                diagonal_block((-i, j, -k), c, shear[4], bulk[4]), py, qx, sz, lanes, OUT + 12, w
+            )
             put_six(s0, lanes, OUT + 18, w)
-            put_sum(block((i, -j, -k), c, shear[4], bulk[4]), px, qy, rz, lanes, OUT + 24, w)
+            put_sum(
+                diagonal_block((i, -j, -k), c, shear[4], bulk[4]), px, qy, rz, lanes, OUT + 24, w
+            )
             put_six(r0, lanes, OUT + 30, w)
             put_six(q0, lanes, OUT + 36, w)
-            put_sum(block((i, j, k), c, shear[4], bulk[4]), qz, ry, sx, lanes, OUT + 42, w)
+            put_sum(diagonal_block((i, j, k), c, shear[4], bulk[4]), qz, ry, sx, lanes, OUT + 42, w)
         for entry in range(6):
             add_out(lanes, OUT + entry, SYMMETRIC, grid, chunk * LANES, rows, blocks[entry])
 
 
-def cell_sums(mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLike) -> NodalSums:
+def make_cell_sums(
+    mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLike
+) -> NodalSums:
     """Energies, forces and their slopes of every tetrahedron of a box mesh, summed at the nodes."""
     assert mesh.planes is not None
     shape = tuple(len(planes) for planes in mesh.planes)
@@ -561,7 +569,7 @@ def cell_sums(mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLik
     rows[number, _WALL:] = (mesh.volumes * made.wall).reshape(-1, 5)
     lumens = np.zeros((len(rows), 5, CONSTANTS))
     lumens[number] = made.lumen_energies(mesh).reshape(-1, 5, CONSTANTS)
-    constants = in_lanes(rows).astype(dtype)
+    constants = pack_lanes(rows).astype(dtype)
     return NodalSums(
         _volume_ratios,
         _volume_changes,
@@ -573,7 +581,7 @@ def cell_sums(mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLik
         # Steps in node number from a cell's corner to the next along x, y, z; the end of the cells.
         nodes=np.array([shape[1] * shape[2], shape[2], 1, number[-1] + 1]),
         constants=constants,
-        lumens=in_groups(lumens, dtype),
+        lumens=pack_groups(lumens, dtype),
         tangent=np.zeros((len(constants), _TANGENT * LANES), dtype=dtype),
         lanes=np.zeros(ROWS * LANES, dtype=dtype),
     )

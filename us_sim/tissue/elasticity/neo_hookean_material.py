@@ -81,7 +81,7 @@ _BARRIER_ONSET, _CRUSHED = np.float32(0.25), np.float32(0.02)
 
 
 @njit(**INLINED)
-def inner(a, b):
+def inner_product(a, b):
     """The sum of the products of the entries of two matrices."""
     return (
         (a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
@@ -178,12 +178,12 @@ def energy_density(h, shear, bulk, wall):
     """The energy density above."""
     beyond = _volume_change_beyond_trace(h)
     change = (h[0] + h[4] + h[8]) + beyond
-    plain = shear * (HALF * inner(h, h) - beyond) + HALF * (bulk * change * change)
+    plain = shear * (HALF * inner_product(h, h) - beyond) + HALF * (bulk * change * change)
     return plain + wall * barrier_term(change)[0]
 
 
 @njit(**INLINED)
-def stress(h, shear, pressure):
+def piola_stress(h, shear, pressure):
     """First Piola-Kirchhoff stress mu F + (p - mu) cof F; p is the other energy's slope by J."""
     c = cofactor_change(h)
     k = pressure - shear
@@ -223,7 +223,7 @@ def _stress_slope(h, c, d, shear, k, rise):
 @njit(**INLINED)
 def volume_slope(h, d):
     """The change of J for a small change d of h."""
-    return inner(cofactor_change(h), d) + (d[0] + d[4] + d[8])
+    return inner_product(cofactor_change(h), d) + (d[0] + d[4] + d[8])
 
 
 @njit(**INLINED)
@@ -239,12 +239,12 @@ def stress_rise(h, d, shear, bulk, k, nodal):
     bulk is the `bulk_slope` at h, and k is p - mu.
     """
     c = cofactor_change(h)
-    rise = bulk * (inner(c, d) + (d[0] + d[4] + d[8])) + nodal
+    rise = bulk * (inner_product(c, d) + (d[0] + d[4] + d[8])) + nodal
     return _stress_slope(h, c, d, shear, k, rise)
 
 
 @njit(**INLINED)
-def block(g, c, shear, bulk):
+def diagonal_block(g, c, shear, bulk):
     """(xx, xy, xz, yy, yz, zz) of mu g.g I + bulk (cof F g)(cof F g)', c being cof F - I.
 
     This is how a node with the shape gradient g resists its own displacement; the rest of the

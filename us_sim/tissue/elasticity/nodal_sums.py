@@ -1,8 +1,8 @@
 """Sums of a neo-Hookean material over tetrahedra at their nodes, sixty-four tetrahedra at a time.
 
 Row r of a buffer begins at r * `LANES` and holds one number a cell or tetrahedron. The functions
-are inlined into the loops that call them, so that the row is a constant there. `cell_sums` are for
-the cells of a box mesh, `tetrahedra_sums` for any mesh; `NeoHookean` adds the nodal averages.
+are inlined into the loops that call them, so that the row is a constant there. `make_cell_sums` are for
+the cells of a box mesh, `make_tetrahedra_sums` for any mesh; `NeoHookean` adds the nodal averages.
 Lumens, which most groups have none of, are added in loops of their own, so that a tissue without
 vessels takes no longer.
 """
@@ -22,7 +22,7 @@ from us_sim.tissue.elasticity.neo_hookean_material import INLINED, lumen_energy,
 LANES = 64
 
 
-def in_lanes(table: NDArray) -> NDArray:
+def pack_lanes(table: NDArray) -> NDArray:
     """(chunks, R * LANES) from (M, R): one row after the other of LANES lines of the table."""
     chunks = -(-len(table) // LANES)
     padded = np.zeros((chunks * LANES, table.shape[1]), dtype=table.dtype)
@@ -32,21 +32,21 @@ def in_lanes(table: NDArray) -> NDArray:
 
 
 @njit(**INLINED)
-def three(rows, row, w):
+def get_three(rows, row, w):
     """Three rows from ``row`` on: a vector."""
     v = row * LANES + w
     return rows[v], rows[v + LANES], rows[v + 2 * LANES]
 
 
 @njit(**INLINED)
-def five(rows, row, w):
+def get_five(rows, row, w):
     """Five rows from ``row`` on, of the five tetrahedra of a cell."""
     v = row * LANES + w
     return (rows[v], rows[v + LANES], rows[v + 2 * LANES], rows[v + 3 * LANES], rows[v + 4 * LANES])
 
 
 @njit(**INLINED)
-def nine(rows, row, w):
+def get_nine(rows, row, w):
     """Nine rows from ``row`` on: a matrix, row by row."""
     v = row * LANES + w
     return (
@@ -98,7 +98,7 @@ ROWS = OUT + 24  # Number of rows of a buffer
 
 
 @njit(**INLINED)
-def gather(field, nodes, lanes):
+def gather_vector(field, nodes, lanes):
     """Fill rows 3 b + axis with the field (3, N) at the b-th node of each tetrahedron."""
     for axis in range(3):
         values = field[axis]
@@ -118,7 +118,7 @@ def gather_scalar(values, nodes, lanes):
 
 
 @njit(**INLINED)
-def scatter(lanes, nodes, field):
+def scatter_vector(lanes, nodes, field):
     """Add rows 3 b + axis from OUT on to the field (3, N) at the b-th node of each tetrahedron."""
     for axis in range(3):
         values = field[axis]
@@ -140,15 +140,15 @@ def scatter_scalar(lanes, nodes, values):
 
 @njit(**INLINED)
 def gradient(field, constants, w):
-    """The gradient of the field whose rows `gather` has made."""
-    x0, y0, z0 = three(field, FIELD, w)
-    x1, y1, z1 = three(field, FIELD + 3, w)
-    x2, y2, z2 = three(field, FIELD + 6, w)
-    x3, y3, z3 = three(field, FIELD + 9, w)
+    """The gradient of the field whose rows `gather_vector` has made."""
+    x0, y0, z0 = get_three(field, FIELD, w)
+    x1, y1, z1 = get_three(field, FIELD + 3, w)
+    x2, y2, z2 = get_three(field, FIELD + 6, w)
+    x3, y3, z3 = get_three(field, FIELD + 9, w)
     x1, y1, z1 = x1 - x0, y1 - y0, z1 - z0
     x2, y2, z2 = x2 - x0, y2 - y0, z2 - z0
     x3, y3, z3 = x3 - x0, y3 - y0, z3 - z0
-    a0, a1, a2, b0, b1, b2, c0, c1, c2 = nine(constants, SHAPE, w)
+    a0, a1, a2, b0, b1, b2, c0, c1, c2 = get_nine(constants, SHAPE, w)
     return (
         x1 * a0 + x2 * b0 + x3 * c0,
         x1 * a1 + x2 * b1 + x3 * c1,
@@ -165,7 +165,7 @@ def gradient(field, constants, w):
 @njit(**INLINED)
 def _put_row(px, py, pz, constants, w, lanes, row):
     """Along the axis of ``row``, the force of the stress's row times volume at all four nodes."""
-    a0, a1, a2, b0, b1, b2, c0, c1, c2 = nine(constants, SHAPE, w)
+    a0, a1, a2, b0, b1, b2, c0, c1, c2 = get_nine(constants, SHAPE, w)
     a = px * a0 + py * a1 + pz * a2
     b = px * b0 + py * b1 + pz * b2
     c = px * c0 + py * c1 + pz * c2
@@ -207,12 +207,12 @@ class NodalSums(NamedTuple):
     diagonal_blocks: Callable[..., None]
     nodes: NDArray[Any]  # how kernels find the nodes of a tetrahedron
     constants: NDArray[Any]  # of each group of tetrahedra
-    lumens: tuple[NDArray[Any], NDArray[Any]]  # of those groups that have one, see `in_groups`
+    lumens: tuple[NDArray[Any], NDArray[Any]]  # of those groups that have one, see `pack_groups`
     tangent: NDArray[Any]  # of each group, which `linearise` fills
     lanes: NDArray[Any]  # work space
 
 
-def in_groups(table: NDArray, dtype: DTypeLike) -> tuple[NDArray[np.int32], NDArray]:
+def pack_groups(table: NDArray, dtype: DTypeLike) -> tuple[NDArray[np.int32], NDArray]:
     """(C,) which row of the other array each group of `LANES` lines has, or -1 if it has no lumen;
     and (L, CONSTANTS * K * LANES) the constants of those that have one.
 
@@ -227,7 +227,7 @@ def in_groups(table: NDArray, dtype: DTypeLike) -> tuple[NDArray[np.int32], NDAr
     there = padded[..., 0].reshape(groups, -1).any(axis=1)
     row = np.where(there, np.cumsum(there) - 1, -1).astype(np.int32)
     lines = padded.transpose(0, 2, 1).reshape(len(padded), -1)
-    return row, in_lanes(lines).astype(dtype)[there]
+    return row, pack_lanes(lines).astype(dtype)[there]
 
 
 @njit(**INLINED)

@@ -46,7 +46,7 @@ class SpringNetwork:
         """The arrays that kernels take."""
         return SpringArrays(self.edges, self.stiffness, self.damping, self.rest_length)
 
-    def forces(
+    def compute_forces(
         self, positions: NDArray[np.float64], velocity: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """(N, 3) N on the nodes, for positions (N, 3) m and velocities (N, 3) m/s."""
@@ -56,7 +56,7 @@ class SpringNetwork:
         )
         return force
 
-    def without(self, fixed: NDArray[np.bool_]) -> SpringNetwork:
+    def drop_fixed(self, fixed: NDArray[np.bool_]) -> SpringNetwork:
         """The network without the springs between two fixed nodes, which have no effect."""
         kept = ~fixed[self.edges].all(axis=1)
         return SpringNetwork(
@@ -66,7 +66,7 @@ class SpringNetwork:
             self.rest_length[kept],
         )
 
-    def factor(self, nodes: NDArray[np.float64]) -> csr_array:
+    def factor_stiffness(self, nodes: NDArray[np.float64]) -> csr_array:
         """B (E, 3N), (N/m)^0.5, such that B'B is the stiffness around unstretched ``nodes``."""
         along = nodes[self.edges[:, 1]] - nodes[self.edges[:, 0]]
         along *= (np.sqrt(self.stiffness) / np.linalg.norm(along, axis=1))[:, None]
@@ -77,7 +77,7 @@ class SpringNetwork:
         return csr_array((entries, (rows, columns.ravel())), shape=(count, 3 * len(nodes)))
 
 
-def springs_of(
+def build_springs(
     mesh: TetrahedralMesh,
     materials: TissueMaterials,
     stiffness_factor: float = 0.002,
@@ -88,13 +88,13 @@ def springs_of(
     Args:
         stiffness_factor: m, spring constant over Young's modulus, for one tetrahedron's edge. The
             paper gives it as a bare number, but it is a length: the right one grows with the mesh's
-            spacing, as `fitted_springs` shows.
+            spacing, as `fit_springs` shows.
         damping_factor: s, damping constant over spring constant.
     """
     return _network(mesh, stiffness_factor * materials.young_modulus, damping_factor)
 
 
-def fitted_springs(
+def fit_springs(
     mesh: TetrahedralMesh, materials: TissueMaterials, damping_factor: float = 0.1
 ) -> SpringNetwork:
     """Springs as stiff as the linear elasticity of the same mesh, whatever its spacing.

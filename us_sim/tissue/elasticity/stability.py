@@ -63,7 +63,7 @@ def highest_frequency(
     return math.sqrt(largest[0])
 
 
-def node_stiffness(factor: csr_array) -> NDArray[np.float64]:
+def bound_node_stiffness(factor: csr_array) -> NDArray[np.float64]:
     """(N,) N/m, d such that the stiffness is nowhere above 2 diag(d) (S. Gershgorin's bound).
 
     It is the sum of a node's spring constants, which holds however they turn and stretch, and about
@@ -89,7 +89,7 @@ def stabilise(
 ) -> tuple[NDArray[np.float64], int, str]:
     """Masses (N,) kg and number of sub-steps that make a step stable, and a remark on them.
 
-    They follow from the bound of `node_stiffness`, so that the step stays stable as the tissue
+    They follow from the bound of `bound_node_stiffness`, so that the step stays stable as the tissue
     deforms. The limit in the remark is that of small oscillations.
 
     Args:
@@ -105,7 +105,7 @@ def stabilise(
     mass, free = model.lumped_mass, ~model.fixed
     if not free.any():
         return mass, 1, ""
-    stiffness = node_stiffness(factor)
+    stiffness = bound_node_stiffness(factor)
     span = time_step**2 + 2 * damping_factor * time_step
     needed = 0.5 * _MARGIN * span * stiffness
     if not (needed > mass)[free].any():
@@ -148,7 +148,7 @@ class InversionWatch:
         """Begin anew, since the tissue was put elsewhere."""
         self._frames_free = 0
 
-    def check(self, positions: NDArray[np.float64], touched: bool) -> tuple[int, bool]:
+    def check_frame(self, positions: NDArray[np.float64], touched: bool) -> tuple[int, bool]:
         """How many are inside out after a frame, and whether to put the tissue back to rest.
 
         Args:
@@ -161,7 +161,7 @@ class InversionWatch:
         return inverted, inverted > 0 and released
 
 
-def watched_tetrahedra(model: TissueModel) -> NDArray[np.int32]:
+def select_watched_tetrahedra(model: TissueModel) -> NDArray[np.int32]:
     """(W, 4), where a press turns tetrahedra inside out first: all, or those under the surface."""
     tetrahedra = model.mesh.tetrahedra
     if len(tetrahedra) <= _WATCHED:
@@ -206,7 +206,7 @@ class ElasticResidual:
         self.largest_load = 0.0  # N, largest norm of contact forces since the tissue was at rest
 
     @classmethod
-    def of(cls, springs: SpringNetwork, nodes: NDArray[np.float64]) -> ElasticResidual:
+    def for_springs(cls, springs: SpringNetwork, nodes: NDArray[np.float64]) -> ElasticResidual:
         """The residual of springs that are undeformed at nodes (N, 3) m."""
         stiffness = float(np.linalg.norm(springs.stiffness))
         return cls(4 * float(np.finfo(np.float64).eps * np.abs(nodes).max()) * stiffness)
@@ -215,7 +215,7 @@ class ElasticResidual:
         """Begin anew, since the tissue was put elsewhere: earlier loads no longer count."""
         self.largest_load = 0.0
 
-    def residual(
+    def compute_residual(
         self,
         elastic: NDArray[np.float64],
         touched: NDArray[np.integer],

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from us_sim.cache import kept
+from us_sim.cache import load_or_create
 from us_sim.errors import SolverError
 from us_sim.kernels import njit
 from us_sim.tissue.elasticity.linear_tetrahedra import (
     AveragedPressure,
-    averaged_pressure,
+    assemble_averaged_pressure,
     require_held,
 )
 from us_sim.tissue.linear_algebra.multifrontal import eliminate
@@ -44,7 +44,7 @@ class DenseFields:
             object.__setattr__(self, name, array)
 
     @classmethod
-    def compute(
+    def compute_at(
         cls, nodes: NDArray[np.integer], forces: int, solve: Solve, precision: type
     ) -> DenseFields:
         """The fields at ``nodes`` (F,) of forces on S nodes.
@@ -59,7 +59,9 @@ class DenseFields:
             fields[3 * first : 3 * chunk[-1] + 3] = solve(chunk)[nodes].transpose(2, 1, 0)
         return cls(nodes, fields)
 
-    def add(self, forces: NDArray[np.float64], displacement: NDArray[np.floating]) -> None:
+    def add_displacement(
+        self, forces: NDArray[np.float64], displacement: NDArray[np.floating]
+    ) -> None:
         """Add the displacement by forces (3S,) N to displacement (N, 3) m; zeros are not read."""
         rows = np.flatnonzero(forces)
         _add_rows(self.fields, rows, forces[rows], self.nodes, displacement)
@@ -137,19 +139,21 @@ class SurfaceCompliance:
         # a frame calls, which depend on the fields' kind and precision, are compiled now.
         self.matrix.flags.writeable = False
         self.gram.flags.writeable = False
-        self.add_field(np.zeros((len(self.nodes), 3)), np.zeros((3, self.count), np.float32))
-        self.field(np.zeros((len(self.nodes), 3)))
-        self.unbalanced(np.ones((len(self.nodes), 3)))
+        self.add_displacement(np.zeros((len(self.nodes), 3)), np.zeros((3, self.count), np.float32))
+        self.compute_displacement(np.zeros((len(self.nodes), 3)))
+        self.compute_imbalance(np.ones((len(self.nodes), 3)))
 
-    def add_field(self, forces: NDArray[np.float64], displacement: NDArray[np.float32]) -> None:
+    def add_displacement(
+        self, forces: NDArray[np.float64], displacement: NDArray[np.float32]
+    ) -> None:
         """Add the displacement by forces (S, 3) N to displacement (3, N) m; zeros are not read."""
-        self.fields.add(forces.ravel(), displacement.T)
+        self.fields.add_displacement(forces.ravel(), displacement.T)
         self._add_surface(forces, self._places[1], displacement)
 
-    def field(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+    def compute_displacement(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 3) m, the displacement of every node by forces (S, 3) N."""
         displacement = np.zeros((self.count, 3))
-        self.fields.add(forces.ravel(), displacement)
+        self.fields.add_displacement(forces.ravel(), displacement)
         self._add_surface(forces, self._places[0], displacement)
         return displacement
 
@@ -166,7 +170,7 @@ class SurfaceCompliance:
         columns = self.matrix[:, None, :]
         _add_rows(columns, rows, forces.ravel()[rows], places, displacement.reshape(-1, 1))
 
-    def unbalanced(self, forces: NDArray[np.float64]) -> float:
+    def compute_imbalance(self, forces: NDArray[np.float64]) -> float:
         """The norm of the unbalanced force in the field of forces (S, 3) N, over that of these."""
         if len(self.gram) == 0:
             return self.rounding
@@ -175,7 +179,7 @@ class SurfaceCompliance:
         return math.sqrt(max(_quadratic(self.gram, rows, loads), 0.0) / float(loads @ loads))
 
 
-def surface_compliance(
+def compute_compliance(
     model: TissueModel,
     progress: Callable[[float, str], None] | None = None,
     *,
@@ -188,7 +192,7 @@ def surface_compliance(
 
     Args:
         progress: called with the fraction done and a label, if it takes a second or more.
-        has_error: whether `SurfaceCompliance.unbalanced` is asked for, a fifth of the work.
+        has_error: whether `SurfaceCompliance.compute_imbalance` is asked for, a fifth of the work.
 
     Raises:
         SolverError: the tissue is not held, its moduli are too different, or the fields do not fit
@@ -204,10 +208,10 @@ def surface_compliance(
         )
     if not _KEPT <= 9 * touched * free <= _MOST_KEPT:
         return _compute(model, progress, has_error)
-    return kept(_key(model), _pack, _unpack, lambda: _compute(model, progress))
+    return load_or_create(_key(model), _pack, _unpack, lambda: _compute(model, progress))
 
 
-def loaded_displacement(model: TissueModel) -> NDArray[np.float64]:
+def compute_loaded_displacement(model: TissueModel) -> NDArray[np.float64]:
     """(N, 3) m, of linear tissue under the model's own load, without a probe.
 
     Raises:
@@ -216,10 +220,10 @@ def loaded_displacement(model: TissueModel) -> NDArray[np.float64]:
     require_held(model.mesh, model.fixed)
     if not model.load.any():
         return np.zeros_like(model.mesh.nodes)
-    system = averaged_pressure(model.mesh, model.materials)
+    system = assemble_averaged_pressure(model.mesh, model.materials)
     with threadpool_limits(1, user_api="blas"):
         eliminated = eliminate(model.mesh, system, model.fixed, np.flatnonzero(~model.fixed))
-        return eliminated.field(model.load).astype(np.float64)
+        return eliminated.compute_displacement(model.load).astype(np.float64)
 
 
 def _compute(
@@ -235,7 +239,7 @@ def _compute(
     free = np.flatnonzero(~model.fixed)
     size = 9 * len(nodes) * len(free)
     is_large = size >= _LARGE
-    system = averaged_pressure(model.mesh, model.materials)
+    system = assemble_averaged_pressure(model.mesh, model.materials)
     matrix = np.empty((3 * len(nodes), 3 * len(nodes)))
     done = 0
     # Products of matrices this small take longer on several threads.
@@ -251,7 +255,7 @@ def _compute(
 
         def solve(chosen: NDArray[np.int64]) -> NDArray[np.floating]:
             nonlocal done
-            moved = eliminated.fields(nodes[chosen])
+            moved = eliminated.compute_fields(nodes[chosen])
             columns = (3 * chosen[:, None] + np.arange(3)).ravel()
             matrix[:, columns] = moved[nodes].reshape(len(matrix), -1)
             done += len(chosen)
@@ -260,7 +264,7 @@ def _compute(
 
         precision = np.float64 if size < _DOUBLE else np.float32
         inner = np.setdiff1d(free, nodes)
-        found = DenseFields.compute(inner, len(nodes), solve, precision)
+        found = DenseFields.compute_at(inner, len(nodes), solve, precision)
         matrix += matrix.T  # symmetric to the last digit
         matrix /= 2
         none = np.zeros((0, 0), np.float32)
@@ -284,7 +288,7 @@ def _gram(
 ) -> NDArray[np.float32]:
     """(3S, 3S), products of the unbalanced forces in the fields of two unit forces."""
     size, free = len(made.matrix), np.flatnonzero(~fixed)
-    system, place = system.of(free), np.cumsum(~fixed) - 1
+    system, place = system.restrict_to(free), np.cumsum(~fixed) - 1
     loaded = (3 * place[made.nodes][:, None] + np.arange(3)).ravel()
     left = np.empty((size, 3 * len(free)), np.float32)
     for first in range(0, size, 3 * _CHUNK):
@@ -292,7 +296,7 @@ def _gram(
         moved = np.empty((len(free), 3, len(part)))
         moved[place[found.nodes]] = found.fields[part].transpose(2, 1, 0)
         moved[place[made.nodes]] = made.matrix[:, part].reshape(-1, 3, len(part))
-        balance = system.forces(moved).reshape(-1, len(part))
+        balance = system.compute_forces(moved).reshape(-1, len(part))
         balance[loaded[part], np.arange(len(part))] -= 1.0
         left[part] = balance.T
     return left @ left.T
@@ -312,7 +316,7 @@ def _rounding(
             distance = np.linalg.norm(points - points[random.integers(len(points))], axis=1)
             load = np.zeros_like(points)
             load[np.argsort(distance)[:count]] = random.normal(size=3)
-            balance = system.forces(made.field(load))
+            balance = system.compute_forces(made.compute_displacement(load))
             balance[made.nodes] -= load
             balance[fixed] = 0.0
             found.append(float(np.linalg.norm(balance) / np.linalg.norm(load)))

@@ -30,17 +30,17 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 
 @dataclass(eq=False)
-class Part:
+class DissectionPart:
     """Nodes that are eliminated together, after those of the parts below."""
 
     own: NDArray[np.int64]
-    parts: list[Part] = field(default_factory=list)
+    parts: list[DissectionPart] = field(default_factory=list)
     boundary: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))  # above it
 
 
 def nested_dissection(
     points: NDArray[np.float64], edges: NDArray[np.integer], largest: int = 60
-) -> Part:
+) -> DissectionPart:
     """The tree of parts.
 
     Args:
@@ -56,9 +56,9 @@ def nested_dissection(
     return root
 
 
-def _dissect(points: NDArray, graph: csr_array, nodes: NDArray, largest: int) -> Part:
+def _dissect(points: NDArray, graph: csr_array, nodes: NDArray, largest: int) -> DissectionPart:
     if len(nodes) <= largest:
-        return Part(nodes)
+        return DissectionPart(nodes)
     axis = int(np.argmax(np.ptp(points[nodes], axis=0)))
     along = points[nodes, axis]
     middle = np.partition(along, len(nodes) // 2)[len(nodes) // 2]
@@ -66,7 +66,7 @@ def _dissect(points: NDArray, graph: csr_array, nodes: NDArray, largest: int) ->
     if not below.any():
         below = along <= middle
         if below.all():
-            return Part(nodes)
+            return DissectionPart(nodes)
     inside = np.zeros(graph.shape[0], dtype=bool)
     inside[nodes[below]] = True
     above = nodes[~below]
@@ -78,10 +78,10 @@ def _dissect(points: NDArray, graph: csr_array, nodes: NDArray, largest: int) ->
     separates[owner[inside[graph.indices[start[owner] + offset]]]] = True
     halves = [nodes[below], above[~separates]]
     parts = [_dissect(points, graph, half, largest) for half in halves if len(half)]
-    return Part(above[separates], parts)
+    return DissectionPart(above[separates], parts)
 
 
-def _bound(part: Part, graph: csr_array, eliminated: NDArray[np.bool_]) -> None:
+def _bound(part: DissectionPart, graph: csr_array, eliminated: NDArray[np.bool_]) -> None:
     for below in part.parts:
         _bound(below, graph, eliminated)
     near = [below.boundary for below in part.parts]
@@ -106,7 +106,7 @@ class _Front:
 
 
 @dataclass(frozen=True, eq=False)
-class Eliminated:
+class EliminatedMesh:
     """A mesh whose parts are eliminated, ready for forces on some of its nodes."""
 
     _fronts: list[_Front]  # a part comes after those below it
@@ -114,7 +114,7 @@ class Eliminated:
     _unknowns: int
     _precision: type
 
-    def fields(self, nodes: NDArray[np.integer]) -> NDArray[np.floating]:
+    def compute_fields(self, nodes: NDArray[np.integer]) -> NDArray[np.floating]:
         """(N, 3, 3K) m/N, displacements by a unit force along each axis at each of nodes (K,).
 
         The nodes are among those that `eliminate` was told; column 3 k + axis is of node k.
@@ -122,15 +122,15 @@ class Eliminated:
         loads = (3 * nodes[:, None] + np.arange(3)).ravel()
         fields: NDArray[np.floating] = np.zeros((self._unknowns, len(loads)), self._precision)
         fields[loads, np.arange(len(loads))] = 1.0
-        return self._solved(fields)
+        return self._solve(fields)
 
-    def field(self, load: NDArray[np.float64]) -> NDArray[np.floating]:
+    def compute_displacement(self, load: NDArray[np.float64]) -> NDArray[np.floating]:
         """(N, 3) m, displacement by forces (N, 3) N on nodes that `eliminate` was told."""
         right: NDArray[np.floating] = np.zeros((self._unknowns, 1), self._precision)
         right[: 3 * self._nodes, 0] = load.ravel()
-        return self._solved(right)[:, :, 0]
+        return self._solve(right)[:, :, 0]
 
-    def _solved(self, fields: NDArray[np.floating]) -> NDArray[np.floating]:
+    def _solve(self, fields: NDArray[np.floating]) -> NDArray[np.floating]:
         """(N, 3, K) m, displacements by forces (unknowns, K), which are overwritten."""
         loaded = np.asarray(fields.any(axis=1))
         for front in self._fronts:
@@ -152,7 +152,7 @@ def eliminate(
     loaded: NDArray[np.integer],
     precision: type = np.float64,
     report: Callable[[float], None] | None = None,
-) -> Eliminated:
+) -> EliminatedMesh:
     """Eliminate all nodes.
 
     Args:
@@ -174,7 +174,7 @@ def eliminate(
             "their moduli too different"
         ) from error
     unknowns = 3 * len(mesh.nodes) + len(system.pressure_nodes)
-    return Eliminated(elimination.fronts, len(mesh.nodes), unknowns, precision)
+    return EliminatedMesh(elimination.fronts, len(mesh.nodes), unknowns, precision)
 
 
 class _Elimination:
@@ -208,7 +208,7 @@ class _Elimination:
         self._loaded[(3 * loaded[:, None] + np.arange(3)).ravel()] = True
         self._done = self._total = 0.0
 
-    def run(self, root: Part) -> None:
+    def run(self, root: DissectionPart) -> None:
         """Eliminate all parts."""
         self._total = self._work(root)
         self._eliminate(root)
@@ -219,12 +219,12 @@ class _Elimination:
         moves = (3 * free[:, None] + np.arange(3)).ravel()
         return moves, self._pressure[nodes[self._pressed[nodes]]]
 
-    def _work(self, part: Part) -> float:
+    def _work(self, part: DissectionPart) -> float:
         size = sum(len(unknowns) for unknowns in self._unknowns(part.own))
         around = sum(len(unknowns) for unknowns in self._unknowns(part.boundary))
         return size * float(size + around) ** 2 + sum(self._work(below) for below in part.parts)
 
-    def _eliminate(self, part: Part) -> _Update:
+    def _eliminate(self, part: DissectionPart) -> _Update:
         """Eliminate a part and those below it; returns the Schur complement around it."""
         updates = [self._eliminate(below) for below in part.parts]
         moves, presses = self._unknowns(part.own)

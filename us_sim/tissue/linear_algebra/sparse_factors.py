@@ -58,7 +58,7 @@ class FactoredStiffness:
         """Share all arrays and the factor, which are replaced and never changed."""
         return copy.copy(self)
 
-    def prepare(
+    def factor_at(
         self,
         displacement: NDArray[np.floating],
         nodes: NDArray[np.integer],

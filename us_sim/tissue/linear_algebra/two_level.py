@@ -335,7 +335,7 @@ class TwoLevel:
         self.fixed = fixed
         self._weight = local_weight
 
-    def prepare(
+    def set_matrix(
         self,
         blocks: NDArray[np.floating],
         nodes: NDArray[np.integer],
@@ -418,7 +418,7 @@ def largest_local_eigenvalue(
 ) -> float:
     """The largest of a stiffness without springs, preconditioned by its blocks (6, N) N/m alone."""
     local = TwoLevel(None, fixed, 1.0)
-    local.prepare(blocks, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
+    local.set_matrix(blocks, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
     vector = np.random.default_rng(0).standard_normal((3, blocks.shape[1]))
     image = np.empty_like(vector)
     largest = 0.0

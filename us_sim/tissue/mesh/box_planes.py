@@ -31,7 +31,7 @@ class DesiredSpacing:
     spacing: NDArray[np.float64]  # (S,) m, in each part
 
 
-def fitted_planes(
+def fit_planes(
     wanted: Sequence[DesiredSpacing], nodes: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Mesh planes (m, ascending) of x, y and z, from the first edge to the last of each.

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
-from us_sim.geometry.triangles import vertex_normals
+from us_sim.geometry.triangles import compute_vertex_normals
 from us_sim.kernels import njit
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
@@ -30,7 +30,7 @@ _ROUNDING = 1e-9  # A barycentric coordinate this far below zero is rounding
 
 
 @dataclass(frozen=True, eq=False)
-class Location:
+class MeshLocation:
     """Points in barycentric coordinates of their tetrahedron, or, outside, of the nearest."""
 
     tetrahedra: NDArray[np.int32]  # (P,)
@@ -38,7 +38,7 @@ class Location:
     outside: NDArray[np.float64]  # (P,) m, distance to the mesh, 0 within it
 
 
-def locate(mesh: TetrahedralMesh, points: NDArray[np.float64]) -> Location:
+def locate_points(mesh: TetrahedralMesh, points: NDArray[np.float64]) -> MeshLocation:
     """Find each point's tetrahedron, or the one whose face on the boundary is nearest to it.
 
     Args:
@@ -79,7 +79,7 @@ def locate(mesh: TetrahedralMesh, points: NDArray[np.float64]) -> Location:
     offset = points - origins[tetrahedra]
     weights = np.einsum("pax,px->pa", gradients[tetrahedra], offset)
     weights[:, 0] += 1.0
-    return Location(tetrahedra, weights, outside)
+    return MeshLocation(tetrahedra, weights, outside)
 
 
 def _cells(points, lower, per_cell, shape):
@@ -233,9 +233,9 @@ class EmbeddedSurface:
     def __init__(
         self, mesh: TetrahedralMesh, vertices: NDArray[np.float64], triangles: NDArray[np.integer]
     ) -> None:
-        vertices, triangles = _checked(vertices, triangles)
-        location = locate(mesh, vertices)
-        far = _far(mesh, location)
+        vertices, triangles = _check_surface(vertices, triangles)
+        location = locate_points(mesh, vertices)
+        far = _find_far(mesh, location)
         if far.any():
             worst = int(np.argmax(location.outside))
             raise MeshError(
@@ -246,7 +246,7 @@ class EmbeddedSurface:
         self._keep(mesh, vertices, triangles, location)
 
     @classmethod
-    def trimmed(
+    def embed_trimmed(
         cls, mesh: TetrahedralMesh, vertices: NDArray[np.float64], triangles: NDArray[np.integer]
     ) -> EmbeddedSurface:
         """The part of a surface that the mesh can carry, its vertices renumbered in order.
@@ -254,19 +254,21 @@ class EmbeddedSurface:
         Raises:
             MeshError: the arrays are no surface, or no whole triangle of it is in the mesh.
         """
-        vertices, triangles = _checked(vertices, triangles)
-        location = locate(mesh, vertices)
-        inside = triangles[~_far(mesh, location)[triangles].any(axis=1)]
+        vertices, triangles = _check_surface(vertices, triangles)
+        location = locate_points(mesh, vertices)
+        inside = triangles[~_find_far(mesh, location)[triangles].any(axis=1)]
         if not len(inside):
             raise MeshError("the surface lies outside the tissue mesh: move it or the mesh")
         used, renumbered = np.unique(inside, return_inverse=True)
-        kept = Location(location.tetrahedra[used], location.weights[used], location.outside[used])
+        kept = MeshLocation(
+            location.tetrahedra[used], location.weights[used], location.outside[used]
+        )
         surface = cls.__new__(cls)
         surface._keep(mesh, vertices[used], renumbered.reshape(-1, 3).astype(np.int32), kept)
         return surface
 
     def _keep(
-        self, mesh: TetrahedralMesh, vertices: NDArray, triangles: NDArray, location: Location
+        self, mesh: TetrahedralMesh, vertices: NDArray, triangles: NDArray, location: MeshLocation
     ) -> None:
         self.triangles = triangles  # (T, 3) int32
         self.vertices = vertices.astype(np.float32)  # (V, 3) m, at rest
@@ -282,15 +284,15 @@ class EmbeddedSurface:
 
         Returns:
             (V, 3) m vertices and (V, 3) unit normals, as
-            `vertex_normals` says.
+            `compute_vertex_normals` says.
 
         Raises:
             MeshError: there are more or fewer nodes than in the mesh.
         """
-        vertices = self.carry(nodes)
-        return vertices, vertex_normals(vertices, self.triangles)
+        vertices = self.deform_vertices(nodes)
+        return vertices, compute_vertex_normals(vertices, self.triangles)
 
-    def carry(self, nodes: NDArray[np.floating]) -> NDArray[np.float32]:
+    def deform_vertices(self, nodes: NDArray[np.floating]) -> NDArray[np.float32]:
         """(V, 3) m, the vertices alone.
 
         Raises:
@@ -310,7 +312,7 @@ class EmbeddedSurface:
         return vertices
 
 
-def _checked(vertices: NDArray, triangles: NDArray) -> tuple[NDArray, NDArray]:
+def _check_surface(vertices: NDArray, triangles: NDArray) -> tuple[NDArray, NDArray]:
     vertices = np.array(vertices, dtype=np.float64, order="C")
     triangles = np.array(triangles, order="C")
     if vertices.ndim != 2 or vertices.shape[1] != 3:
@@ -338,7 +340,7 @@ def _checked(vertices: NDArray, triangles: NDArray) -> tuple[NDArray, NDArray]:
     return vertices, triangles.astype(np.int32)
 
 
-def _far(mesh: TetrahedralMesh, location: Location) -> NDArray[np.bool_]:
+def _find_far(mesh: TetrahedralMesh, location: MeshLocation) -> NDArray[np.bool_]:
     """(V,) whether a vertex is too far outside the mesh to go with it."""
     corners = mesh.nodes[mesh.tetrahedra[location.tetrahedra]]
     sides = corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from us_sim.errors import MeshError
 from us_sim.geometry.mesh_file import read_with_meshio
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, repair
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, repair_mesh
 
 _NO_MESH = (
     "this is not a tetrahedral mesh that can be read: give a Gmsh, VTK or VTU file, whole and of "
@@ -58,8 +58,8 @@ def read_mesh(
         with np.errstate(over="ignore"):
             nodes = points * metres_per_unit
         if pose is not None:
-            nodes = pose.apply(nodes)
-        mesh, repaired = repair(nodes, tetrahedra)
+            nodes = pose.transform_points(nodes)
+        mesh, repaired = repair_mesh(nodes, tetrahedra)
         size = float(np.ptp(mesh.nodes, axis=0).max())
         if not _SIZES[0] <= size <= _SIZES[1]:
             raise MeshError(

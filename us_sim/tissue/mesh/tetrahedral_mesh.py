@@ -16,14 +16,14 @@ from us_sim.errors import MeshError
 from us_sim.geometry.mesh_faces import (
     FACES,
     MOST_NODES,
-    boundary_faces,
-    boundary_triangles,
-    face_order,
+    find_boundary_faces,
+    find_boundary_triangles,
+    sort_faces,
 )
 from us_sim.geometry.pose import PLACE, Placement
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import format_count
 
 # Boxes of cells between planes, and boxes of tetrahedra whose faces follow the structures.
 _LEAST_NODES = 64
@@ -79,36 +79,38 @@ class MeshSettings(Settings):
         if self.file is not None:
             for key, value in box.items():
                 if value is not None:
-                    raise self.refused("", f"has both `file` and `{key}`; keep one")
+                    raise self.make_error("", f"has both `file` and `{key}`; keep one")
             return
         if self.lower is None or self.upper is None:
-            raise self.refused(
+            raise self.make_error(
                 "lower" if self.lower is None else "upper",
                 "is missing; give the corners of a box, or a `file`",
             )
         if self.unit != 1.0 or self.pose != Placement() or self.margin is not None:
-            raise self.refused("", "`unit`, `pose` and `margin` are for a mesh from a `file` only")
+            raise self.make_error(
+                "", "`unit`, `pose` and `margin` are for a mesh from a `file` only"
+            )
         if isinstance(self.nodes, int):
             if self.planes:
-                raise self.refused(
+                raise self.make_error(
                     "nodes", "must be three numbers where `planes` say where the nodes are"
                 )
             if self.nodes < _LEAST_NODES:
-                raise self.refused(
+                raise self.make_error(
                     "nodes", f"{self.nodes} make no box: give {_LEAST_NODES} or more"
                 )
         elif max(self.nodes) > _MOST_ALONG:
-            raise self.refused(
+            raise self.make_error(
                 f"nodes[{self.nodes.index(max(self.nodes))}]",
                 f"{max(self.nodes)} is outside 2 to {_MOST_ALONG}",
             )
         for name in self.planes:
             if name not in ("x", "y", "z"):
-                raise self.refused("planes", f"unknown axis `{name}`; axes are x, y and z")
+                raise self.make_error("planes", f"unknown axis `{name}`; axes are x, y and z")
         for axis, name in enumerate("xyz"):
             lower, upper = self.lower[axis], self.upper[axis]
             if lower >= upper:
-                raise self.refused(
+                raise self.make_error(
                     f"upper[{axis}]",
                     f"{upper:g} m is not above tissue.mesh.lower[{axis}], {lower:g} m",
                 )
@@ -119,10 +121,10 @@ class MeshSettings(Settings):
         self, axis: str, planes: tuple[float, ...], lower: float, upper: float, count: int
     ) -> None:
         if len(planes) < 2 or any(b <= a for a, b in itertools.pairwise(planes)):
-            raise self.refused(f"planes.{axis}", "needs two or more rising coordinates")
+            raise self.make_error(f"planes.{axis}", "needs two or more rising coordinates")
         ends = zip((planes[0], planes[-1]), (lower, upper), strict=True)
         if len(planes) != count or not all(math.isclose(a, b, abs_tol=1e-9) for a, b in ends):
-            raise self.refused(
+            raise self.make_error(
                 f"planes.{axis}",
                 f"must be {count} coordinates from {lower:g} to {upper:g} m, as nodes, lower and "
                 f"upper say",
@@ -154,8 +156,8 @@ def check_mesh(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> N
     if not used.all():
         idle = np.flatnonzero(~used)
         raise MeshError(
-            f"{counted(len(idle), 'mesh node belongs', 'mesh nodes belong')} to no tetrahedron, "
-            f"such as node {idle[0]}: remove them, or call `repair`"
+            f"{format_count(len(idle), 'mesh node belongs', 'mesh nodes belong')} to no tetrahedron, "
+            f"such as node {idle[0]}: remove them, or call `repair_mesh`"
         )
     _check_places(nodes)
     _check_volumes(nodes, tetrahedra)
@@ -182,13 +184,13 @@ def check_arrays(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) ->
     bad = np.flatnonzero(~np.isfinite(nodes).all(axis=1))
     if len(bad):
         raise MeshError(
-            f"{counted(len(bad), 'mesh node is', 'mesh nodes are')} not finite, such as node "
+            f"{format_count(len(bad), 'mesh node is', 'mesh nodes are')} not finite, such as node "
             f"{bad[0]} at {nodes[bad[0]].tolist()}: give every node three numbers"
         )
     bad = np.flatnonzero((np.abs(nodes) > _FARTHEST).any(axis=1))
     if len(bad):
         raise MeshError(
-            f"{counted(len(bad), 'mesh node is', 'mesh nodes are')} farther than {_FARTHEST:g} m "
+            f"{format_count(len(bad), 'mesh node is', 'mesh nodes are')} farther than {_FARTHEST:g} m "
             f"away, such as node {bad[0]} at {nodes[bad[0]].tolist()}: give coordinates in metres"
         )
     if tetrahedra.min() < 0 or tetrahedra.max() >= len(nodes):
@@ -216,8 +218,8 @@ def _check_places(nodes: NDArray[np.float64]) -> None:
     if len(same):
         node, other = sorted((int(order[same[0]]), int(order[same[0] + 1])))
         raise MeshError(
-            f"{counted(len(same), 'mesh node lies', 'mesh nodes lie')} exactly where another one "
-            f"lies, such as node {other} on node {node}: join them, or call `repair`"
+            f"{format_count(len(same), 'mesh node lies', 'mesh nodes lie')} exactly where another one "
+            f"lies, such as node {other} on node {node}: join them, or call `repair_mesh`"
         )
 
 
@@ -237,12 +239,12 @@ def _check_volumes(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) 
         (
             np.flatnonzero(volumes < -smallest),
             "inverted",
-            "order its nodes so that its volume is positive, or call `repair`",
+            "order its nodes so that its volume is positive, or call `repair_mesh`",
         ),
     ):
         if len(bad):
             raise MeshError(
-                f"{counted(len(bad), 'tetrahedron is', 'tetrahedra are')} "
+                f"{format_count(len(bad), 'tetrahedron is', 'tetrahedra are')} "
                 f"{what}, such as tetrahedron {bad[0]} (volume {volumes[bad[0]]:.3g} m3): {remedy}"
             )
 
@@ -254,17 +256,17 @@ def _check_faces(tetrahedra: NDArray[np.integer]) -> None:
     same = np.flatnonzero((whole[order[1:]] == whole[order[:-1]]).all(axis=1))
     if len(same):
         raise MeshError(
-            f"{counted(len(same), 'tetrahedron is', 'tetrahedra are')} repeated, such as "
+            f"{format_count(len(same), 'tetrahedron is', 'tetrahedra are')} repeated, such as "
             f"tetrahedron {order[same[0] + 1]}, which has the nodes of tetrahedron "
-            f"{order[same[0]]}: keep each once, or call `repair`"
+            f"{order[same[0]]}: keep each once, or call `repair_mesh`"
         )
-    order, starts, counts = face_order(tetrahedra)
+    order, starts, counts = sort_faces(tetrahedra)
     crowded = np.flatnonzero(counts > 2)
     if len(crowded):
         first = starts[crowded[0]]
         several = (order[first : first + counts[crowded[0]]] // 4).tolist()
         raise MeshError(
-            f"the mesh is not manifold: {counted(len(crowded), 'face belongs', 'faces belong')} "
+            f"the mesh is not manifold: {format_count(len(crowded), 'face belongs', 'faces belong')} "
             f"to more than two tetrahedra, such as one of tetrahedra "
             f"{', '.join(map(str, several))}: take out those that overlap"
         )
@@ -273,7 +275,7 @@ def _check_faces(tetrahedra: NDArray[np.integer]) -> None:
     folded = np.flatnonzero(_turn(tetrahedra, one) == _turn(tetrahedra, other))
     if len(folded):
         raise MeshError(
-            f"{counted(len(folded), 'pair of tetrahedra lies', 'pairs of tetrahedra lie')} on the "
+            f"{format_count(len(folded), 'pair of tetrahedra lies', 'pairs of tetrahedra lie')} on the "
             f"same side of the face they share, such as {one[folded[0]] // 4} and "
             f"{other[folded[0]] // 4}: they overlap, mend the mesh"
         )
@@ -302,7 +304,7 @@ def _check_hinges(tetrahedra: NDArray, one: NDArray, other: NDArray) -> None:
         node = hinges[0]
         raise MeshError(
             f"{bodies} parts of the mesh hang together by nodes or edges only, "
-            f"{counted(len(hinges), 'node', 'nodes')} in all, such as node {node} between "
+            f"{format_count(len(hinges), 'node', 'nodes')} in all, such as node {node} between "
             f"tetrahedra {_with_node(tetrahedra, body == lowest[node], node)} and "
             f"{_with_node(tetrahedra, body == highest[node], node)}: join such parts by faces, or "
             f"give each its own nodes"
@@ -361,12 +363,12 @@ class TetrahedralMesh:
     @cached_property
     def boundary(self) -> NDArray[np.int32]:
         """(F, 3) triangles that belong to one tetrahedron only, normals pointing outward."""
-        return boundary_triangles(self.tetrahedra)
+        return find_boundary_triangles(self.tetrahedra)
 
     @cached_property
     def boundary_tetrahedra(self) -> NDArray[np.int32]:
         """(F,) the tetrahedron that each triangle of the boundary belongs to."""
-        return (boundary_faces(self.tetrahedra) // 4).astype(np.int32)
+        return (find_boundary_faces(self.tetrahedra) // 4).astype(np.int32)
 
     @cached_property
     def parts(self) -> NDArray[np.int64]:
@@ -423,7 +425,7 @@ def box_mesh(planes_x: ArrayLike, planes_y: ArrayLike, planes_z: ArrayLike) -> T
     return TetrahedralMesh(nodes, tetrahedra, tuple(planes))
 
 
-def repair(nodes: ArrayLike, tetrahedra: ArrayLike) -> tuple[TetrahedralMesh, tuple[str, ...]]:
+def repair_mesh(nodes: ArrayLike, tetrahedra: ArrayLike) -> tuple[TetrahedralMesh, tuple[str, ...]]:
     """A mesh from nodes and tetrahedra that may be in disorder.
 
     Nodes in exactly the same place become one, and tetrahedra that have no volume because of that,
@@ -455,7 +457,7 @@ def repair(nodes: ArrayLike, tetrahedra: ArrayLike) -> tuple[TetrahedralMesh, tu
         number[order] = np.arange(len(kept))
         corners = number[joined.reshape(-1)][corners]
         report.append(
-            _said("joined", len(places) - len(whole), "node", "with another in its place")
+            _format_repair("joined", len(places) - len(whole), "node", "with another in its place")
         )
         places = places[np.sort(first)]
 
@@ -466,20 +468,20 @@ def repair(nodes: ArrayLike, tetrahedra: ArrayLike) -> tuple[TetrahedralMesh, tu
     repeated[once] = False
     for bad, what in ((collapsed, "that names a node twice"), (repeated & ~collapsed, "repeated")):
         if bad.any():
-            report.append(_said("left out", bad.sum(), "tetrahedron", what))
+            report.append(_format_repair("left out", bad.sum(), "tetrahedron", what))
     corners = corners[~(collapsed | repeated)]
 
     used, renumbered = np.unique(corners, return_inverse=True)
     if len(used) < len(places):
         left_out = len(places) - len(used)
-        report.append(_said("left out", left_out, "node", "that no tetrahedron uses"))
+        report.append(_format_repair("left out", left_out, "node", "that no tetrahedron uses"))
         places, corners = places[used], renumbered.reshape(-1, 4)
 
     inverted = signed_volumes(places, corners) < 0
     if inverted.any():
         corners = corners.astype(np.int32)
         corners[inverted] = corners[inverted][:, [0, 1, 3, 2]]
-        report.append(_said("turned", inverted.sum(), "inverted tetrahedron"))
+        report.append(_format_repair("turned", inverted.sum(), "inverted tetrahedron"))
     try:
         return TetrahedralMesh(places, corners.astype(np.int32)), tuple(report)
     except MeshError as error:
@@ -487,7 +489,7 @@ def repair(nodes: ArrayLike, tetrahedra: ArrayLike) -> tuple[TetrahedralMesh, tu
         raise MeshError(f"{error}{done}") from error
 
 
-def _said(verb: str, count: int, thing: str, how: str = "") -> str:
+def _format_repair(verb: str, count: int, thing: str, how: str = "") -> str:
     plural = thing.replace("tetrahedron", "tetrahedra") if "hedron" in thing else f"{thing}s"
     if count > 1:
         how = how.replace("names", "name").replace("its place", "their place")

@@ -25,7 +25,7 @@ An error of the model, such as linear strain in a deep press, is no part of it.
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 >>> side = np.linspace(0.0, 1.0, 9)
 >>> mesh = box_mesh(side, side, side)
->>> interpolation_error(mesh, mesh.nodes @ np.ones((3, 3)))[0] < 1e-12  # linear: none
+>>> estimate_interpolation_error(mesh, mesh.nodes @ np.ones((3, 3)))[0] < 1e-12  # linear: none
 True
 """
 
@@ -50,7 +50,7 @@ from us_sim.tissue.model import TissueModel
 _LOOP: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 
-def relative_error(
+def estimate_relative_error(
     model: TissueModel,
     compliance: SurfaceCompliance,
     pose: Pose | None,
@@ -68,15 +68,15 @@ def relative_error(
         forces: (N, 3) N, of contact.
         reach: m, nodes farther from the probe stay untouched.
     """
-    missing, moved = interpolation_error(model.mesh, displacement)
+    missing, moved = estimate_interpolation_error(model.mesh, displacement)
     apart = 0.0
     if pose is not None:
-        closing = contact_error(model, compliance, pose, displacement, forces, reach)
+        closing = estimate_contact_error(model, compliance, pose, displacement, forces, reach)
         apart = float(np.linalg.norm(closing) / np.linalg.norm(displacement))
     return math.hypot(missing / moved, apart)
 
 
-def contact_error(
+def estimate_contact_error(
     model: TissueModel,
     compliance: SurfaceCompliance,
     pose: Pose,
@@ -86,17 +86,17 @@ def contact_error(
 ) -> NDArray[np.float64]:
     """(N, 3) m, how linear tissue moves from the contact that it has to one of its nodes alone.
 
-    The arguments are those of `relative_error`.
+    The arguments are those of `estimate_relative_error`.
     """
     nodes = compliance.nodes
     places = model.mesh.nodes[nodes] + displacement[nodes]
-    gap, normal = FlaredProbe(model.collider, model.contact_spacing).distance(pose, places)
+    gap, normal = FlaredProbe(model.collider, model.contact_spacing).measure_distances(pose, places)
     held = np.ascontiguousarray(forces[nodes])
     change = predict_forces(compliance.matrix, gap, normal, held, np.zeros(len(nodes)), reach)
-    return compliance.field(change)
+    return compliance.compute_displacement(change)
 
 
-def force_error(
+def estimate_force_error(
     mesh: TetrahedralMesh, materials: TissueMaterials, displacement: NDArray[np.float64]
 ) -> float:
     """By how much, relative, the mesh is too stiff for a displacement (N, 3) m that is not zero.
@@ -105,7 +105,7 @@ def force_error(
     >>> block = TissueModel.block((1.0, 1.0, 1.0), (5, 5, 5))
     >>> x, _, z = block.mesh.nodes.T - [[0.0], [0.0], [0.5]]
     >>> bent = 1e-6 * np.stack([-x * z, 0 * x, 0 * x], axis=1)
-    >>> 0.02 < force_error(block.mesh, block.materials, bent) < 0.2  # four cells across: 1 / 15
+    >>> 0.02 < estimate_force_error(block.mesh, block.materials, bent) < 0.2  # four cells across: 1 / 15
     True
     """
     slope = np.einsum("eai,eaj->eij", displacement[mesh.tetrahedra], shape_gradients(mesh))
@@ -123,7 +123,7 @@ def force_error(
     return float(shear @ squares / 20 / (shear @ (strain**2).sum(axis=1)))
 
 
-def interpolation_error(
+def estimate_interpolation_error(
     mesh: TetrahedralMesh, displacement: NDArray[np.float64]
 ) -> tuple[float, float]:
     """L2 norms over the volume, in m times the root of m3, of the quadratic functions that a

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.compliant_contact import CompliantContact
 from us_sim.tissue.contact.probe_gap import wrench_on_probe
-from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
-from us_sim.tissue.elasticity.stability import count_inverted, watched_tetrahedra
-from us_sim.tissue.linear_algebra.compliance import loaded_displacement, surface_compliance
+from us_sim.tissue.contact.stiffness import compliance_between, compute_contact_stiffness
+from us_sim.tissue.elasticity.stability import count_inverted, select_watched_tetrahedra
+from us_sim.tissue.linear_algebra.compliance import compute_compliance, compute_loaded_displacement
 from us_sim.tissue.model import Deformation, TissueModel, TissueState
 from us_sim.tissue.solvers.solver import Progress, SolverSettings, TissueSolver
 
@@ -75,16 +75,16 @@ class Fem(TissueSolver):
         progress: Progress | None = None,
     ) -> None:
         settings = settings or FemSettings()
-        self._compliance = surface_compliance(model, progress)
+        self._compliance = compute_compliance(model, progress)
         self._reached = self._compliance.nodes
-        self._loaded = loaded_displacement(model)
+        self._loaded = compute_loaded_displacement(model)
         self._contact = CompliantContact(
             model.collider,
             (model.mesh.nodes + self._loaded)[self._reached],
             model.contact_spacing,
             self._compliance.matrix,
         )
-        self._watched = watched_tetrahedra(model)
+        self._watched = select_watched_tetrahedra(model)
         self._displacement = self._loaded.copy()
         super().__init__(model, settings, progress)
 
@@ -97,13 +97,13 @@ class Fem(TissueSolver):
     def _sag(self) -> NDArray[np.float64]:
         return self._loaded
 
-    def contact_stiffness(self) -> NDArray[np.float64] | None:
+    def compute_contact_stiffness(self) -> NDArray[np.float64] | None:
         """Exact, as the tissue is linear."""
         pushed = np.flatnonzero(self._contact.forces.any(axis=1))
         if self._pose is None or len(pushed) == 0:
             return np.zeros((6, 6))
         touched = self._reached[pushed]
-        return contact_stiffness(
+        return compute_contact_stiffness(
             self.model.collider,
             self._pose,
             self.model.mesh.nodes[touched] + self._displacement[touched],
@@ -122,13 +122,13 @@ class Fem(TissueSolver):
         if pose is None:
             contact.clear()
         else:
-            solved = contact.press(pose)
-            displacement = compliance.field(contact.forces)
+            solved = contact.press_at(pose)
+            displacement = compliance.compute_displacement(contact.forces)
             for _ in range(_EXTENSIONS):
-                if not contact.overlooked(pose, displacement[self._reached]):
+                if not contact.add_overlooked(pose, displacement[self._reached]):
                     break
                 solved = contact.solve(pose)
-                displacement = compliance.field(contact.forces)
+                displacement = compliance.compute_displacement(contact.forces)
             else:
                 solved = False
             if not solved:
@@ -147,6 +147,8 @@ class Fem(TissueSolver):
         forces = contact.forces[pushed]
         force, torque = wrench_on_probe(pose, nodes[touched], forces)
         load = float(np.linalg.norm(forces))
-        residual = math.hypot(contact.sliding_force / load, compliance.unbalanced(contact.forces))
+        residual = math.hypot(
+            contact.sliding_force / load, compliance.compute_imbalance(contact.forces)
+        )
         inverted = count_inverted(nodes, self._watched)
         return Deformation(nodes, touched, force, torque, residual, actions, inverted)

@@ -23,12 +23,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from us_sim.geometry.pose import Pose, same_pose
+from us_sim.geometry.pose import Pose, is_same_pose
 from us_sim.settings.setting import setting
 from us_sim.tissue.contact.active_set import ActiveSet
 from us_sim.tissue.contact.probe_gap import wrench_on_probe
-from us_sim.tissue.elasticity.linear_tetrahedra import free_stiffness, require_held, stiffness
-from us_sim.tissue.elasticity.stability import count_inverted, watched_tetrahedra
+from us_sim.tissue.elasticity.linear_tetrahedra import (
+    assemble_stiffness,
+    drop_fixed_nodes,
+    require_held,
+)
+from us_sim.tissue.elasticity.stability import count_inverted, select_watched_tetrahedra
 from us_sim.tissue.linear_algebra.conjugate_gradients import conjugate_gradients, product_rows
 from us_sim.tissue.model import Deformation, TissueModel, TissueState
 from us_sim.tissue.solvers.solver import (
@@ -93,13 +97,13 @@ class FemCg(TissueSolver):
         require_held(model.mesh, model.fixed)
         settings = settings or FemCgSettings()
         super().__init__(model, settings, progress)
-        self._watched = watched_tetrahedra(model)
+        self._watched = select_watched_tetrahedra(model)
         self._tolerance = settings.tolerance
         updates = min(settings.contact_updates, settings.iterations)
         self._rounds = np.diff(np.linspace(0, settings.iterations, updates + 1).round().astype(int))
 
         free = ~model.fixed
-        matrix = free_stiffness(stiffness(model.mesh, model.materials), model.fixed)
+        matrix = drop_fixed_nodes(assemble_stiffness(model.mesh, model.materials), model.fixed)
         self._free = np.flatnonzero(free)
         self._matrix = (matrix.indptr, matrix.indices, matrix.data)
         rows = np.repeat(np.arange(len(self._free)), np.diff(matrix.indptr))
@@ -151,10 +155,10 @@ class FemCg(TissueSolver):
         if untouched and contact.is_consistent(pose, displacement[self._touchable]):
             return self._resting()
         if self._taken_over and pose is not None:
-            contact.adopt(pose, displacement[self._touchable])
+            contact.mark_touching(pose, displacement[self._touchable])
             self._renew_equations()
         self._taken_over = False
-        moved = not same_pose(pose, self._pose)
+        moved = not is_same_pose(pose, self._pose)
         for round_number, iterations in enumerate(self._rounds):
             surface = displacement[self._touchable]
             enough = 0.5 * self._tolerance * self._reference
@@ -182,13 +186,13 @@ class FemCg(TissueSolver):
             contact.set_forces(product_rows(*self._matrix, displacement, self._touchable))
             load = float(np.linalg.norm(np.maximum(contact.normal_force, 0.0)))
             self._reference = load or self._largest_load
-        return self._outcome(pose)
+        return self._make_deformation(pose)
 
-    def _outcome(self, pose: Pose | None) -> Deformation:
+    def _make_deformation(self, pose: Pose | None) -> Deformation:
         contact, displacement = self._contact, self._displacement
         everywhere = np.arange(len(self._free), dtype=self._touchable.dtype)
         unbalanced = product_rows(*self._matrix, displacement, everywhere)
-        normal = contact.normal_at(pose, displacement[self._touchable])
+        normal = contact.compute_normals(pose, displacement[self._touchable])
         holding = np.einsum("ij,ij->i", unbalanced[self._touchable], normal)
         push = np.where(contact.touched, np.maximum(holding, 0.0), 0.0)[:, None] * normal
         unbalanced[self._touchable] -= push

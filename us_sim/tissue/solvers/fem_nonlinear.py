@@ -26,19 +26,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from us_sim.geometry.pose import Pose, same_pose
-from us_sim.geometry.se3 import interpolate
+from us_sim.geometry.pose import Pose, is_same_pose
+from us_sim.geometry.se3 import interpolate_poses
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.tissue.contact.complementarity import predict_forces
 from us_sim.tissue.contact.probe_gap import GAP_TOLERANCE, wrench_on_probe
-from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
+from us_sim.tissue.contact.stiffness import compliance_between, compute_contact_stiffness
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
 from us_sim.tissue.elasticity.neo_hookean_material import require_solid
-from us_sim.tissue.linear_algebra.compliance import surface_compliance
+from us_sim.tissue.linear_algebra.compliance import compute_compliance
 from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
 from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
-from us_sim.tissue.solvers.discretisation_error import relative_error
+from us_sim.tissue.solvers.discretisation_error import estimate_relative_error
 from us_sim.tissue.solvers.frame_budget import FrameBudget
 from us_sim.tissue.solvers.newton import Newton
 from us_sim.tissue.solvers.solver import (
@@ -130,9 +130,9 @@ class FemNonlinear(TissueSolver):
         self._reported_depth = TUNING.reported_depth * spacing  # m
         self._predicted_gap = TUNING.predicted_gap * smallest  # m
         self._budget = FrameBudget()
-        self._recovery = Recovery(self._newton.displacement)
+        self._recovery = InversionRecovery(self._newton.displacement)
         if len(self._surface):
-            self._compliance = surface_compliance(model, progress, has_error=False)
+            self._compliance = compute_compliance(model, progress, has_error=False)
         self._restore(self.state)
 
     @property
@@ -145,11 +145,11 @@ class FemNonlinear(TissueSolver):
     def _sag(self) -> NDArray[np.float64]:
         return self._newton.rest.T
 
-    def contact_stiffness(self) -> NDArray[np.float64] | None:
+    def compute_contact_stiffness(self) -> NDArray[np.float64] | None:
         """Approximate: tissue as at rest, forces that do not turn."""
         newton, contact = self._newton, self._newton.contact
         law = contact.slope, contact.gap, contact.normal
-        gap, normal, softness = newton.points.nodal_springs(*law)
+        gap, normal, softness = newton.points.merge_springs(*law)
         pushed = np.flatnonzero(np.isfinite(gap[self._surface]))
         if self._pose is None or len(pushed) == 0:
             return np.zeros((6, 6))
@@ -158,7 +158,7 @@ class FemNonlinear(TissueSolver):
         compliance = compliance_between(self._compliance.matrix, pushed)
         across = normal[nodes, :, None] * normal[nodes, None, :]
         compliance += block_diag(*(softness[nodes, None, None] * across))
-        return contact_stiffness(
+        return compute_contact_stiffness(
             self.model.collider,
             self._pose,
             self.model.mesh.nodes[nodes] + newton.displacement.T[nodes],
@@ -168,7 +168,7 @@ class FemNonlinear(TissueSolver):
             (normal[nodes], np.zeros((len(nodes), 3, 3))),
         )
 
-    def discretisation_error(self) -> float | None:
+    def estimate_discretisation_error(self) -> float | None:
         """See `us_sim.tissue.solvers.discretisation_error`. Unknown of frames that are not in
         balance.
         """
@@ -176,7 +176,7 @@ class FemNonlinear(TissueSolver):
         known = last.is_balanced and not last.interventions and len(self._surface)
         if not known or np.array_equal(last.nodes, rest):
             return None
-        return relative_error(
+        return estimate_relative_error(
             self.model,
             self._compliance,
             self._pose,
@@ -199,13 +199,13 @@ class FemNonlinear(TissueSolver):
                 self._newton.set_displacement(displacement)
         self._recovery.reset(self._newton.displacement)
 
-    def _rehearse(self) -> None:
-        self._newton.rehearse()
+    def _compile_rare_kernels(self) -> None:
+        self._newton.compile_kernels()
 
     def _advance(self, pose: Pose | None) -> Deformation:
         newton, budget, settings = self._newton, self._budget, self.settings
-        asked, moved = pose, not same_pose(pose, self._target)
-        budget.begin(
+        asked, moved = pose, not is_same_pose(pose, self._target)
+        budget.begin_frame(
             settings.most_iterations,
             settings.frame_budget,
             self.frame_limit,
@@ -239,7 +239,7 @@ class FemNonlinear(TissueSolver):
         self._settled = self._solve(tolerance, start, actions)
         self._was_balanced = not self._exceeds(settings.frame_tolerance)
         self._catches_up &= is_behind or not self._was_balanced
-        outcome = self._outcome(pose, motion, actions)
+        outcome = self._make_deformation(pose, motion, actions)
         if is_behind:
             self._settled = False
             return replace(outcome, is_balanced=False)
@@ -295,7 +295,7 @@ class FemNonlinear(TissueSolver):
 
     def _is_unloaded(self, pose: Pose | None) -> bool:
         """Whether nothing reaches the tissue at rest."""
-        return pose is None or self._newton.depth_at_rest(pose) <= GAP_TOLERANCE
+        return pose is None or self._newton.measure_depth_at_rest(pose) <= GAP_TOLERANCE
 
     def _next_step(self, pose: Pose) -> Pose:
         """The next load step on the way to a pose, or the last one until that is in balance."""
@@ -307,7 +307,7 @@ class FemNonlinear(TissueSolver):
     def _load_steps(self, pose: Pose) -> list[Pose]:
         newton, box = self._newton, self.model.collider.offset_box
         last = self._target if newton.contact_norm > 0.0 else None
-        return load_steps(last, pose, newton.depth(pose), math.hypot(box[0], box[1]))
+        return plan_load_steps(last, pose, newton.measure_depth(pose), math.hypot(box[0], box[1]))
 
     def _approach(self, pose: Pose) -> None:
         """Go most of a long way in load steps, as far as the budget allows."""
@@ -333,7 +333,7 @@ class FemNonlinear(TissueSolver):
         self._target = pose
         # As if each node had the springs of its points to itself.
         firm = np.where(contact.gap < 0.0, contact.stiffness, 0.0)
-        gap, normal, softness = points.nodal_springs(firm, contact.gap, contact.normal)
+        gap, normal, softness = points.merge_springs(firm, contact.gap, contact.normal)
         change = predict_forces(
             self._compliance.matrix,
             gap[self._surface],
@@ -343,7 +343,7 @@ class FemNonlinear(TissueSolver):
             self._predicted_gap,
         )
         field = np.zeros(newton.displacement.shape, np.float32)
-        self._compliance.add_field(change, field)
+        self._compliance.add_displacement(change, field)
         return field.astype(np.float64)
 
     def _obstacle(self) -> str:
@@ -358,11 +358,13 @@ class FemNonlinear(TissueSolver):
             "of its volume"
         )
 
-    def _outcome(self, pose: Pose | None, motion: float, actions: list[str]) -> Deformation:
+    def _make_deformation(
+        self, pose: Pose | None, motion: float, actions: list[str]
+    ) -> Deformation:
         newton, recovery = self._newton, self._recovery
         interventions = Intervention.NONE
         reached = newton.displacement
-        recovery.judge(reached, newton.tissue.smallest_volume_ratio(reached) > 0.0)
+        recovery.record_frame(reached, newton.tissue.smallest_volume_ratio(reached) > 0.0)
         if recovery.inverted_frames:
             actions.append("still inside out, so the last upright state is shown")
             interventions |= Intervention.SHOWED_UPRIGHT
@@ -403,7 +405,7 @@ class FemNonlinear(TissueSolver):
         )
 
 
-class Recovery:
+class InversionRecovery:
     """Keeps the last state of the tissue that was not inside out, and says when to begin anew.
 
     Args:
@@ -419,7 +421,7 @@ class Recovery:
         self.inverted_frames = 0  # in a row
         self.restarts = False  # whether the next frame begins anew from rest
 
-    def judge(self, displacement: NDArray[np.float64], is_upright: bool) -> None:
+    def record_frame(self, displacement: NDArray[np.float64], is_upright: bool) -> None:
         """Take note of the displacement (3, N) m at the end of a frame."""
         if is_upright:
             self.upright, self.inverted_frames = displacement, 0
@@ -436,13 +438,13 @@ class Recovery:
         return restarts
 
 
-def load_steps(last: Pose | None, pose: Pose, depth: float, arm: float) -> list[Pose]:
+def plan_load_steps(last: Pose | None, pose: Pose, depth: float, arm: float) -> list[Pose]:
     """Poses on the way of a probe, so that tissue is swept aside and not left where it was hit.
 
-    >>> steps = load_steps(Pose(), Pose([0.0, 0.0, 0.008]), depth=0.008, arm=0.02)
+    >>> steps = plan_load_steps(Pose(), Pose([0.0, 0.0, 0.008]), depth=0.008, arm=0.02)
     >>> [f"{pose.position[2]:.4f}" for pose in steps]
     ['0.0027', '0.0053']
-    >>> leap = load_steps(None, Pose([0, 0, 0.03]), depth=0.006, arm=0.02)
+    >>> leap = plan_load_steps(None, Pose([0, 0, 0.03]), depth=0.006, arm=0.02)
     >>> [f"{pose.position[2]:.4f}" for pose in leap]
     ['0.0270']
 
@@ -458,7 +460,7 @@ def load_steps(last: Pose | None, pose: Pose, depth: float, arm: float) -> list[
         way = math.dist(last.position, pose.position) + arm * turned
         count = math.ceil(way / length)
         if count <= most:
-            return [interpolate(last, pose, k / count) for k in range(1, count)]
+            return [interpolate_poses(last, pose, k / count) for k in range(1, count)]
     count = min(math.ceil(depth / length), most)
     backs = [(1 - k / count) * depth for k in range(1, count)]
     return [Pose(pose.position - x * pose.rotation[:, 2], pose.orientation) for x in backs]

@@ -1,7 +1,7 @@
 """The time and the iterations that a frame of ``fem_nonlinear`` may take.
 
->>> from us_sim.tissue.solvers.frame_budget import Pace
->>> pace = Pace(sending=0.0005, cores=2)
+>>> from us_sim.tissue.solvers.frame_budget import FramePace
+>>> pace = FramePace(sending=0.0005, cores=2)
 >>> pace.spend(0.02)
 >>> f"{1e3 * pace.limit:.1f} ms"
 '10.7 ms'
@@ -34,7 +34,7 @@ class FrameBudget:
         """Count frames of a probe at rest anew."""
         self._frames_at_rest = 0
 
-    def begin(
+    def begin_frame(
         self,
         iterations: int,
         strict_limit: float | None = None,
@@ -78,7 +78,7 @@ class FrameBudget:
         """Whether the time that is left is for the pose itself, and no longer for load steps."""
         return self._iterations_within(TUNING.load_step_time) < TUNING.least_iterations
 
-    def spend(self, iterations: int) -> None:
+    def spend_iterations(self, iterations: int) -> None:
         """Subtract the iterations of a Newton step, and its fixed cost."""
         self.iterations_left -= iterations + TUNING.newton_step_cost
 
@@ -88,7 +88,7 @@ class FrameBudget:
 
     def end_step(self, iterations: int) -> None:
         """As `spend`, with the time since `begin_step`."""
-        self.spend(iterations)
+        self.spend_iterations(iterations)
         now = self._clock()
         self.step_time, self._now = now - self._now, now
         self._iteration_time = self.step_time / (iterations + TUNING.newton_step_cost)
@@ -125,7 +125,7 @@ LEAST = 0.002
 """s, that every frame may take."""
 
 
-class Pace:
+class FramePace:
     """The time limit of each frame, so that poses at 60 Hz are kept up with.
 
     What a frame takes beyond a period is subtracted from the limits of those after it.
@@ -150,7 +150,7 @@ class Pace:
         """s, that the next frame may take."""
         return max(self._undelayed - self._waited, LEAST)
 
-    def spend(self, duration: float) -> None:
+    def count_frame(self, duration: float) -> None:
         """Count a frame that took so long (s), with sending it."""
         self._waited = min(max(0.0, self._waited + duration - PERIOD), PERIOD)
 
@@ -160,7 +160,7 @@ def _usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def shortest(work: Callable[[], object]) -> float:
+def time_shortest_run(work: Callable[[], object]) -> float:
     """s, on the wall, of the shortest of five runs of ``work``."""
     times = []
     for _ in range(5):

@@ -15,14 +15,14 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.geometry.collider_distance import rotate, rotate_back
+from us_sim.geometry.collider_distance import rotate_vector, rotate_vector_back
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
-from us_sim.settings.spelling import counted
-from us_sim.tissue.contact.probe_gap import only_forward, push_out, pushing_gap
-from us_sim.tissue.elasticity.springs import fitted_springs, spring_forces, springs_of
+from us_sim.settings.spelling import format_count
+from us_sim.tissue.contact.probe_gap import measure_gaps, pushes_only_forward, pushing_gap
+from us_sim.tissue.elasticity.springs import build_springs, fit_springs, spring_forces
 from us_sim.tissue.elasticity.stability import (
     ElasticResidual,
     InversionWatch,
@@ -95,12 +95,12 @@ class ProbeMotion(NamedTuple):
     """The probe's shape, and where it is in each step; in S = 0 steps when there is no probe."""
 
     box: NDArray[np.float64]  # the collider's `offset_box`
-    forward: bool  # see `us_sim.tissue.contact.probe_gap.only_forward`
+    forward: bool  # see `us_sim.tissue.contact.probe_gap.pushes_only_forward`
     rotations: NDArray[np.float64]  # (S, 3, 3), probe to patient
     origins: NDArray[np.float64]  # (S, 3), m
 
 
-class Contact(NamedTuple):
+class ParticleContact(NamedTuple):
     """The particles that the probe can touch, and the kernels' results for them."""
 
     reachable: NDArray[np.int32]  # (C,), the particles
@@ -109,7 +109,7 @@ class Contact(NamedTuple):
     wrench: NDArray[np.float64]  # (2, 3), N and N m on the probe in its frame, mean of the frame
 
     @classmethod
-    def at(cls, reachable: NDArray[np.int32]) -> Contact:
+    def make_untouched(cls, reachable: NDArray[np.int32]) -> ParticleContact:
         """A contact in which nothing is touched."""
         count = len(reachable)
         return cls(reachable, np.zeros(count, bool), np.zeros((count, 3)), np.zeros((2, 3)))
@@ -153,18 +153,18 @@ class Msds(TissueSolver):
         super().__init__(model, settings, progress)
         mesh, materials, damping = model.mesh, model.materials, settings.damping_factor
         if settings.stiffness == "fitted":
-            springs = fitted_springs(mesh, materials, damping)
+            springs = fit_springs(mesh, materials, damping)
         else:
-            springs = springs_of(mesh, materials, settings.stiffness_factor, damping)
-        self._springs = springs.without(model.fixed)
-        self._residual_norm = ElasticResidual.of(self._springs, mesh.nodes)
+            springs = build_springs(mesh, materials, settings.stiffness_factor, damping)
+        self._springs = springs.drop_fixed(model.fixed)
+        self._residual_norm = ElasticResidual.for_springs(self._springs, mesh.nodes)
         self._inversion = InversionWatch(model)
         self._positions = model.mesh.nodes.copy()
         self._velocity = np.zeros_like(self._positions)
         self._steps = settings.steps
         self._rest_tolerance = settings.rest_tolerance
         self._damping_factor = settings.damping_factor
-        self._factor = self._springs.factor(mesh.nodes)
+        self._factor = self._springs.factor_stiffness(mesh.nodes)
         self.mass, self._substeps, remark = stabilise(
             model,
             self._factor,
@@ -176,11 +176,11 @@ class Msds(TissueSolver):
         self._actions = (remark,) if remark else ()
         self._time_step = settings.time_step / self._substeps
         self._inverse_mass = np.where(model.fixed, 0.0, 1.0 / self.mass)
-        self._forward = only_forward(model.collider, model.contact_spacing)
+        self._forward = pushes_only_forward(model.collider, model.contact_spacing)
         self._particles = Particles(
             self._inverse_mass, self._positions, self._velocity, np.zeros_like(self._positions)
         )
-        self._contact = Contact.at(model.movable_contact_nodes)
+        self._contact = ParticleContact.make_untouched(model.movable_contact_nodes)
         self._restore(self.state)
 
     @property
@@ -205,7 +205,7 @@ class Msds(TissueSolver):
         self._contact.touched[:] = False
 
     def _advance(self, pose: Pose | None) -> Deformation:
-        if self._settled and not self._contact.touched.any() and not self._entered(pose):
+        if self._settled and not self._contact.touched.any() and not self._is_entered(pose):
             return replace(
                 self._resting(),
                 nodes=self._positions.copy(),
@@ -225,7 +225,7 @@ class Msds(TissueSolver):
             self._substeps,
             self._steps,
         )
-        return self._outcome(pose, *self._contact.wrench.copy())
+        return self._make_deformation(pose, *self._contact.wrench.copy())
 
     def _untangle(self, touched: bool) -> tuple[int, tuple[str, ...], Intervention]:
         """Put tissue to rest that stayed inside out without a probe.
@@ -233,15 +233,15 @@ class Msds(TissueSolver):
         Returns:
             How many tetrahedra are inside out now, remarks, and these as a code.
         """
-        inverted, hopeless = self._inversion.check(self._positions, touched)
+        inverted, hopeless = self._inversion.check_frame(self._positions, touched)
         if not hopeless:
-            words = f"{counted(inverted, 'tetrahedron is', 'tetrahedra are')} inside out"
+            words = f"{format_count(inverted, 'tetrahedron is', 'tetrahedra are')} inside out"
             return inverted, (words,) if inverted else (), Intervention.NONE
         self._positions[:] = self.model.mesh.nodes
         self._velocity[:] = 0.0
         self._residual_norm.reset()
         words = (
-            f"{counted(inverted, 'tetrahedron', 'tetrahedra')} stayed inside out, so the tissue "
+            f"{format_count(inverted, 'tetrahedron', 'tetrahedra')} stayed inside out, so the tissue "
             f"was put back to rest"
         )
         return 0, (words,), Intervention.PUT_TO_REST
@@ -256,22 +256,22 @@ class Msds(TissueSolver):
         self._residual_norm.reset()
         return True
 
-    def _gap(self, pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return push_out(
+    def _measure_gaps(self, pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return measure_gaps(
             self.model.collider,
             pose,
             self._positions[self.model.movable_contact_nodes],
             self.model.contact_spacing,
         )
 
-    def _entered(self, pose: Pose | None) -> bool:
-        return pose is not None and bool((self._gap(pose)[0] < 0).any())
+    def _is_entered(self, pose: Pose | None) -> bool:
+        return pose is not None and bool((self._measure_gaps(pose)[0] < 0).any())
 
     def _path(self, pose: Pose | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Rotations (S, 3, 3) and origins (S, 3) m of the probe at each step; S = 0 without one."""
         if pose is None:
             return np.empty((0, 3, 3)), np.empty((0, 3))
-        before = self._pose or self._lifted(pose)
+        before = self._pose or self._lift(pose)
         fraction = np.arange(1, self._steps + 1)[:, None] / self._steps
         origins = before.position + fraction * (pose.position - before.position)
         if np.array_equal(before.orientation, pose.orientation):
@@ -282,23 +282,25 @@ class Msds(TissueSolver):
             rotations = np.array([Pose(orientation=turn).rotation for turn in turns])
         return rotations, origins
 
-    def _lifted(self, pose: Pose) -> Pose:
+    def _lift(self, pose: Pose) -> Pose:
         """The start of a probe that was not there before: lifted straight up until it is clear."""
-        gap, _ = self._gap(pose)
+        gap, _ = self._measure_gaps(pose)
         depth = max(0.0, -float(gap.min(initial=0.0)))
         return Pose(pose.position - depth * pose.rotation[:, 2], pose.orientation)
 
-    def _outcome(
+    def _make_deformation(
         self, pose: Pose | None, force: NDArray[np.float64], torque: NDArray[np.float64]
     ) -> Deformation:
         is_touched = bool(self._contact.touched.any())
         inverted, words, interventions = self._untangle(is_touched)
         still = np.zeros_like(self._velocity)
-        elastic = self._springs.forces(self._positions, still)
+        elastic = self._springs.compute_forces(self._positions, still)
         elastic[self.model.fixed] = 0.0
         touched = self.model.movable_contact_nodes[self._contact.touched]
-        normal = np.zeros((0, 3)) if pose is None else self._gap(pose)[1][self._contact.touched]
-        residual = self._residual_norm.residual(-elastic, touched, normal)
+        normal = (
+            np.zeros((0, 3)) if pose is None else self._measure_gaps(pose)[1][self._contact.touched]
+        )
+        residual = self._residual_norm.compute_residual(-elastic, touched, normal)
 
         frame = max(self._steps * self._substeps * self._time_step, REST_TIME)
         speed = np.abs(self._velocity).max()
@@ -308,7 +310,7 @@ class Msds(TissueSolver):
         self._settled = bool(
             max(speed * max(frame, self._damping_factor), acceleration * frame**2)
             < self._rest_tolerance
-            and not self._entered(pose)
+            and not self._is_entered(pose)
         )
         if self._settled and self._stop(is_touched):
             residual = 0.0
@@ -332,7 +334,7 @@ def advance_frame(springs, particles, probe, contact, time_step, substeps, steps
         springs: their `SpringArrays`.
         particles: `Particles`, moved here.
         probe: `ProbeMotion` of S = ``steps`` steps, or of none.
-        contact: `Contact`, filled in here as of the last sub-step; its wrench is added to.
+        contact: `ParticleContact`, filled in here as of the last sub-step; its wrench is added to.
     """
     inverse_mass, positions, velocity, force = particles
     duration = time_step * steps * substeps
@@ -366,11 +368,11 @@ def _stop_at_probe(particles, probe, step, contact, duration):
         a = positions[i, 0] - origin[0]
         b = positions[i, 1] - origin[1]
         c = positions[i, 2] - origin[2]
-        x, y, z = rotate_back(r, a, b, c)
+        x, y, z = rotate_vector_back(r, a, b, c)
         gap, u, v, w = pushing_gap(probe.box, probe.forward, 0.0, x, y, z)
         if gap >= 0.0:
             continue
-        nx, ny, nz = rotate(r, u, v, w)
+        nx, ny, nz = rotate_vector(r, u, v, w)
         positions[i, 0] -= gap * nx
         positions[i, 1] -= gap * ny
         positions[i, 2] -= gap * nz

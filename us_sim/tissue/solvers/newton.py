@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import SolverError
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.surface_points import add_springs, add_turns, surface_contact
+from us_sim.tissue.contact.surface_points import add_springs, add_turns, make_surface_contact
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
 from us_sim.tissue.linear_algebra.sparse_factors import FactoredStiffness
 from us_sim.tissue.linear_algebra.two_level import (
@@ -79,7 +79,7 @@ class Newton:
         self._rest_blocks: NDArray[np.floating] = rest.astype(self._dtype)
         most = largest_local_eigenvalue(rest, self.tissue.tangent_product, self._fixed)
         self._two_level = TwoLevel(grid, self._fixed, TUNING.local_weight / most)
-        self.points, self.contact = surface_contact(model)
+        self.points, self.contact = make_surface_contact(model)
         self.displacement = np.zeros((3, len(mesh.nodes)))  # m
         self._load = np.ascontiguousarray(model.load.T)  # (3, N) N, besides that of the probe
         self.load_norm = _norm(self._load)  # N
@@ -109,7 +109,7 @@ class Newton:
                 f"gravity or forces are too much for its moduli"
             )
         self.rest = self.displacement
-        self._points_at_rest = self.points.placed(self.rest)
+        self._points_at_rest = self.points.compute_positions(self.rest)
         self.reset()
 
     def reset(self) -> None:
@@ -125,10 +125,10 @@ class Newton:
         self._conditioner: Preconditioner | None = None  # of the last step
         self.iteration_limit = TUNING.first_iteration_limit  # of the next step
         self._needs_factor = False  # whether a step since has needed more iterations than allowed
-        self._give_factor_back()
+        self._drop_factor()
         self._assemble()
 
-    def _give_factor_back(self) -> None:
+    def _drop_factor(self) -> None:
         """Precondition without a factor until a step needs one, as at every new pose.
 
         A small tissue goes on with factors once a step has needed one: they cost it little.
@@ -137,24 +137,24 @@ class Newton:
         self._has_factor = False  # whether one was made at this pose that still serves
         self._factors_left = TUNING.most_factors  # that may be made at this pose
 
-    def depth_at_rest(self, pose: Pose) -> float:
+    def measure_depth_at_rest(self, pose: Pose) -> float:
         """How deep (m) a probe would be in the tissue at rest."""
-        return self.contact.depth(pose, self._points_at_rest)
+        return self.contact.measure_depth(pose, self._points_at_rest)
 
-    def depth(self, pose: Pose) -> float:
+    def measure_depth(self, pose: Pose) -> float:
         """How deep (m) a probe would be in the tissue as it is."""
-        return self.contact.depth(pose, self.points.placed(self.displacement))
+        return self.contact.measure_depth(pose, self.points.compute_positions(self.displacement))
 
     def set_pose(self, pose: Pose) -> None:
         """Put the probe at a pose; nothing moves."""
         self._carried_force = self.contact.normal_force
         self._carried_norm = self.contact_norm
-        self._positions = self.points.placed(self.displacement)
+        self._positions = self.points.compute_positions(self.displacement)
         self.contact.set_pose(pose, self._positions)
         # Damping by nodes' own blocks would halve the first step of the smoothest modes.
         self._damping = 0.0
         self.iteration_limit = TUNING.first_iteration_limit
-        self._give_factor_back()
+        self._drop_factor()
         self._assemble_contact()
 
     def remove_probe(self) -> None:
@@ -171,7 +171,7 @@ class Newton:
             m, by how much tissue may move for it; infinite where that is not known.
         """
         change = self.contact.update_relief()
-        self._positions = self.points.placed(self.displacement)
+        self._positions = self.points.compute_positions(self.displacement)
         if self.contact.drop_planes(self._positions):
             change = np.inf
         self._assemble_contact()
@@ -184,7 +184,7 @@ class Newton:
 
     def _move(self, displacement: NDArray[np.float64]) -> None:
         self.displacement = displacement
-        self._positions = self.points.placed(displacement, self.contact.near)
+        self._positions = self.points.compute_positions(displacement, self.contact.near)
         self.contact.update_gaps(self._positions)
 
     def _assemble(self, energy: float | None = None) -> None:
@@ -197,7 +197,7 @@ class Newton:
         contact = self.contact
         self.energy = self._tissue_energy + contact.energy if energy is None else energy
         self.contact_forces = np.zeros_like(self._tissue_forces)
-        self.points.add(contact.force, self.contact_forces, contact.near)
+        self.points.add_to_nodes(contact.force, self.contact_forces, contact.near)
         self.residual = self._tissue_forces - self.contact_forces
         clear_nodes(self.residual, self._fixed)
         self.residual_norm = _norm(self.residual)
@@ -208,13 +208,15 @@ class Newton:
 
     def _evaluate(self) -> float:
         """J, energy at the displacement; finds the tissue's forces there too, less its load."""
-        self._tissue_energy = self.tissue.energy_and_forces(self.displacement, self._tissue_forces)
+        self._tissue_energy = self.tissue.compute_energy_and_forces(
+            self.displacement, self._tissue_forces
+        )
         if self.load_norm > 0.0:
             self._tissue_energy -= _dot(self._load, self.displacement)
             self._tissue_forces -= self._load
         return self._tissue_energy + self.contact.energy
 
-    def rehearse(self) -> None:
+    def compile_kernels(self) -> None:
         """Take a step with a factor, with damping and with points deep in the probe, as only some
         frames do.
         """
@@ -329,9 +331,9 @@ class Newton:
         tolerance: float | None = None  # N
         interval = TUNING.contact_interval
         while True:
-            moved = points.moved(step, contact.near)
+            moved = points.interpolate_field(step, contact.near)
             residual = -self._tissue_forces - image
-            points.add(contact.force_after(moved), residual, contact.near)
+            points.add_to_nodes(contact.force_after(moved), residual, contact.near)
             clear_nodes(residual, self._fixed)
             norm = _norm(residual)
             if tolerance is None:
@@ -350,7 +352,7 @@ class Newton:
                 """The springs' forces, added."""
                 add_springs(*springs, change, image)
 
-            lumped = points.lumped(active, directions, stiffness)
+            lumped = points.lump_springs(active, directions, stiffness)
             self._conditioner = self._preconditioner(blocks, *lumped)
             solved = conjugate_gradients(
                 tangent_product,
@@ -383,8 +385,8 @@ class Newton:
         """
         pull = -_dot(change, self._tissue_forces + image)
         curvature = _dot(change, change_image)
-        along = self.points.moved(change, self.contact.near)
-        return self.contact.length_along(moved, along, pull, curvature)
+        along = self.points.interpolate_field(change, self.contact.near)
+        return self.contact.find_best_length(moved, along, pull, curvature)
 
     def _preconditioner(
         self,
@@ -404,12 +406,12 @@ class Newton:
                 self._factored = FactoredStiffness(self._model)
             if self.is_small or (not self._has_factor and self._factors_left > 0):
                 self._factors_left -= 1
-                self._has_factor = self._factored.prepare(
+                self._has_factor = self._factored.factor_at(
                     self.displacement, nodes, directions, stiffness
                 )
             if self._has_factor:
                 return self._factored
-        self._two_level.prepare(blocks, nodes, directions, stiffness)
+        self._two_level.set_matrix(blocks, nodes, directions, stiffness)
         return self._two_level
 
     def _search(self, change: NDArray[np.float64]) -> float:

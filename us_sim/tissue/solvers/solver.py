@@ -11,8 +11,8 @@ True
 
 A tissue as small as can be, on which a solver calls the same kernels as on another.
 
->>> from us_sim.tissue.solvers.solver import rehearsal_model
->>> len(rehearsal_model(TissueModel.block()).mesh.tetrahedra)
+>>> from us_sim.tissue.solvers.solver import make_small_model
+>>> len(make_small_model(TissueModel.block()).mesh.tetrahedra)
 40
 """
 
@@ -28,15 +28,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import SolverError
-from us_sim.geometry.pose import Pose, same_pose
+from us_sim.geometry.pose import Pose, is_same_pose
 from us_sim.settings.quantity import Quantity
-from us_sim.settings.reading import Reader
+from us_sim.settings.reading import SettingsReader
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import Settings
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
-from us_sim.tissue.solvers.discretisation_error import force_error
+from us_sim.tissue.solvers.discretisation_error import estimate_force_error
 
 Progress = Callable[[float, str], None]
 """Told the fraction done of what takes long, and what is being made."""
@@ -114,7 +114,7 @@ class TissueSolver(ABC):
         Args:
             probe_pose: in frame ``patient``, or None when no probe is near.
         """
-        if self._settled and same_pose(probe_pose, self._pose):
+        if self._settled and is_same_pose(probe_pose, self._pose):
             return self._last
         good = self.state
         deformation = self._advance(probe_pose)
@@ -124,7 +124,7 @@ class TissueSolver(ABC):
             if deformation.residual > self.most_unbalanced:
                 deformation = replace(deformation, is_balanced=False)
         else:
-            deformation = self._recovered(good)
+            deformation = self._recover(good)
         self._last = deformation
         return deformation
 
@@ -133,7 +133,7 @@ class TissueSolver(ABC):
         """Whether another frame at the same pose would change nothing."""
         return self._settled
 
-    def _recovered(self, good: TissueState) -> Deformation:
+    def _recover(self, good: TissueState) -> Deformation:
         """The result in place of a frame that failed; the next one tries again."""
         self._failures += 1
         if self._failures < _FAILURES:
@@ -182,10 +182,10 @@ class TissueSolver(ABC):
 
     def warm_up(self) -> None:
         """Compile the kernels on a tissue of eight cells; the solver's own state stays."""
-        self.rehearse(rehearsal_model(self.model), self.settings)
+        self.compile_kernels(make_small_model(self.model), self.settings)
 
     @classmethod
-    def rehearse(cls, model: TissueModel, settings: SolverSettings) -> None:
+    def compile_kernels(cls, model: TissueModel, settings: SolverSettings) -> None:
         """Make a solver for `warm_up`, and call every kernel that its frames may need."""
         try:
             solver = cls(model, settings)
@@ -193,12 +193,12 @@ class TissueSolver(ABC):
             solver = cls(model)
         for depth in (0.002, 0.004):
             solver.deform(Pose(position=np.array([depth, 0.0, depth])))
-            solver.contact_stiffness()
-            solver.discretisation_error()
-        solver._rehearse()
+            solver.compute_contact_stiffness()
+            solver.estimate_discretisation_error()
+        solver._compile_rare_kernels()
         solver.deform(None)
 
-    def _rehearse(self) -> None:  # noqa: B027 - most solvers have none of these
+    def _compile_rare_kernels(self) -> None:  # noqa: B027 - most solvers have none of these
         """Call, for `warm_up`, the kernels that only some frames need."""
 
     @property
@@ -206,7 +206,7 @@ class TissueSolver(ABC):
     def state(self) -> TissueState:
         """A copy of where the tissue is."""
 
-    def contact_stiffness(self) -> NDArray[np.float64] | None:
+    def compute_contact_stiffness(self) -> NDArray[np.float64] | None:
         """How the wrench of the last frame changes with the probe's pose.
 
         Returns:
@@ -215,7 +215,7 @@ class TissueSolver(ABC):
         """
         return None
 
-    def discretisation_error(self) -> float | None:
+    def estimate_discretisation_error(self) -> float | None:
         """Estimated relative L2 error of the last frame's displacement to the continuum's.
 
         Returns:
@@ -223,7 +223,7 @@ class TissueSolver(ABC):
         """
         return None
 
-    def force_error(self) -> float | None:
+    def estimate_force_error(self) -> float | None:
         """Estimate by how much, relative, the mesh is too stiff, and so the last frame's force off.
 
         Returns:
@@ -232,7 +232,7 @@ class TissueSolver(ABC):
         moved = self._last.nodes - self.model.mesh.nodes
         if not (self.bears_load and self._last.is_balanced and moved.any()):
             return None
-        return force_error(self.model.mesh, self.model.materials, moved)
+        return estimate_force_error(self.model.mesh, self.model.materials, moved)
 
     @abstractmethod
     def _advance(self, pose: Pose | None) -> Deformation:
@@ -281,12 +281,12 @@ def create_solver(
     """
     solver = SOLVERS.load(name)
     if settings is None:
-        settings = Reader(f"solver {name}", error=SolverError).read(solver.Settings, values)
+        settings = SettingsReader(f"solver {name}", error=SolverError).read(solver.Settings, values)
     made: TissueSolver = solver(model, settings, progress)
     return made
 
 
-def rehearsal_model(model: TissueModel) -> TissueModel:
+def make_small_model(model: TissueModel) -> TissueModel:
     """A tissue of eight cells, like another in what decides which kernels are used: a box mesh or
     another, the highest Poisson's ratio, how far moduli are apart, lumens, and the probe.
     """

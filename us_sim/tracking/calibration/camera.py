@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import format_count
 from us_sim.tracking.camera.fiducial_detector import FiducialDetector
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rigid_body import RigidBody
@@ -50,12 +50,12 @@ def find_board(image: NDArray[np.uint8], board: RigidBody) -> BoardView | None:
 
     None where it shows fewer than six, or they are all in one row.
     """
-    seen = FiducialDetector(board).detect(image)
+    seen = FiducialDetector(board).detect_markers(image)
     if board.chessboard is not None:
         # Where its markers are depends on how the board was drawn; where its squares meet does not.
         points, pixels = board.chessboard.corners[seen.chessboard_ids], seen.chessboard_corners
     else:
-        points, pixels, _ = seen.correspondences(board)
+        points, pixels, _ = seen.match_points(board)
     if len(points) < _FEWEST_CORNERS:
         return None
     if np.linalg.matrix_rank(points[:, :2] - points[:, :2].mean(axis=0), tol=1e-6) < 2:
@@ -128,7 +128,7 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Cam
     """
     if len(views) < _FEWEST_VIEWS:
         raise CalibrationError(
-            f"the board is seen in {counted(len(views), 'photo')}, and {_FEWEST_VIEWS} are the "
+            f"the board is seen in {format_count(len(views), 'photo')}, and {_FEWEST_VIEWS} are the "
             f"least (20 are good): take more, tilted to all sides"
         )
     reach = _reach(views, width, height)

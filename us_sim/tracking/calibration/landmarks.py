@@ -69,7 +69,7 @@ def register_landmarks(
     names = tuple(names) or tuple(str(k + 1) for k in range(len(known)))
     _check(measured, known, names)
     pose = _fit(measured, known)
-    residuals = np.linalg.norm(pose.apply(measured) - known, axis=1)
+    residuals = np.linalg.norm(pose.transform_points(measured) - known, axis=1)
     fre = math.sqrt(float((residuals**2).mean()))
     _check_fit(measured, known, residuals, fre, names)
     left_out = _leave_one_out(measured, known)
@@ -131,7 +131,9 @@ def _leave_one_out(measured: Array, known: Array) -> Array:
         for k in range(len(known)):
             others = np.arange(len(known)) != k
             pose = _fit(measured[others], known[others])
-            errors[k] = np.linalg.norm(pose.apply(measured[k : k + 1]) - known[k : k + 1])
+            errors[k] = np.linalg.norm(
+                pose.transform_points(measured[k : k + 1]) - known[k : k + 1]
+            )
     return errors
 
 

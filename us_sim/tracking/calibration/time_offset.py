@@ -37,7 +37,7 @@ class PositionSignal:
         return len(self.times)
 
 
-def signal_of_positions(
+def compute_position_signal(
     times: NDArray[np.float64], positions: NDArray[np.float64]
 ) -> PositionSignal:
     """The first principal component of positions (K, 3) m at times (K,) s; its sign is arbitrary.

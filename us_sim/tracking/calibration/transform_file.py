@@ -28,7 +28,7 @@ import yaml
 
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Placement, Pose
-from us_sim.settings.reading import Reader
+from us_sim.settings.reading import SettingsReader
 from us_sim.settings.text_files import read_yaml
 
 
@@ -46,7 +46,7 @@ def read_transform(path: str | Path) -> Pose:
             f"{path}: holds no transform; it needs the keys {' and '.join(keys)}"
         )
     written = {key: document[key] for key in keys}
-    return Reader(str(path), error=CalibrationError).read(Placement, written).pose
+    return SettingsReader(str(path), error=CalibrationError).read(Placement, written).pose
 
 
 def write_transform(

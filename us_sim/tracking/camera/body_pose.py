@@ -4,11 +4,11 @@ A plane has two poses in a perspective image: IPPE (Collins and Bartoli, "Infini
 pose estimation", IJCV 109, 2014) gives both, Gauss-Newton refines them, and the evidence of all
 images so far chooses one.
 
->>> from us_sim.tracking.camera.body_pose import body_poses
+>>> from us_sim.tracking.camera.body_pose import estimate_body_poses
 >>> from us_sim.tracking.camera.markers import square
 >>> camera = CameraModel(640, 480, [[600, 0, 320], [0, 600, 240], [0, 0, 1]])
 >>> true = Pose([0.02, 0.01, 0.4], [1.0, 0.2, 0.1, 0.0])
->>> poses = body_poses(camera, square(0.04), camera.project(true.apply(square(0.04))))
+>>> poses = estimate_body_poses(camera, square(0.04), camera.project(true.apply(square(0.04))))
 >>> poses[0].pose.position.round(6)
 array([0.02, 0.01, 0.4 ])
 >>> [round(each.error, 1) for each in poses]  # pixels, of the pose and of the other one
@@ -35,7 +35,7 @@ marker that faces the camera has."""
 _Guess = tuple[NDArray[np.float64], NDArray[np.float64]]  # rotation (3, 3), position (3,) m
 
 
-def plane_poses(points: NDArray[np.float64], rays: NDArray[np.float64]) -> list[_Guess]:
+def solve_plane_poses(points: NDArray[np.float64], rays: NDArray[np.float64]) -> list[_Guess]:
     """Rotations (3, 3) and positions (3,) m that take points in a plane before their rays.
 
     OpenCV's SQPNP, which needs no plane, gives one of the two poses only.
@@ -87,14 +87,14 @@ class PlaneAmbiguity:
         """Forget all images."""
         self._evidence = 0.0
 
-    def chosen(self, found: list[BodyPose], before: Pose | None) -> BodyPose:
+    def choose_pose(self, found: list[BodyPose], before: Pose | None) -> BodyPose:
         """The pose that follows the one before, unless by now the images speak for the other."""
         if len(found) == 1 or before is None:
             return found[0]
         near, far = _by_nearness(found, before)
         return near if _FORGETTING * self._evidence + self._ratio(near, far) >= 0 else far
 
-    def settled(
+    def record_choice(
         self, found: list[BodyPose], pose: BodyPose, before: Pose | None
     ) -> NDArray[np.float64]:
         """Learn from an image of which a pose was chosen.
@@ -150,7 +150,7 @@ class BodyPose:
     misfit: float  # twice the negative log likelihood of Huber's distribution, and a constant
 
 
-def body_poses(
+def estimate_body_poses(
     camera: CameraModel,
     points: NDArray[np.float64],
     pixels: NDArray[np.float64],
@@ -179,7 +179,7 @@ def body_poses(
     """
     points = np.ascontiguousarray(points, dtype=np.float64)
     pixels = np.ascontiguousarray(pixels, dtype=np.float64)
-    rays = camera.rays(pixels)
+    rays = camera.compute_rays(pixels)
     if len(points) < 4 or not np.isfinite(rays).all():
         return []
     guesses = _guesses(points, rays, pixels, owners)
@@ -188,7 +188,7 @@ def body_poses(
     if not guesses:
         return []
     places = np.concatenate([points @ turn.T + place for turn, place in guesses])
-    offsets = camera.project(places).reshape(-1, len(points), 2) - pixels
+    offsets = camera.project_points(places).reshape(-1, len(points), 2) - pixels
     misfits = [_misfit(_lengths(each, deviation)) for each in offsets]
     found: list[BodyPose] = []
     for i in np.argsort(misfits, kind="stable")[: _REFINED + 1].tolist():
@@ -219,11 +219,13 @@ def _guesses(
     extents = np.linalg.svd(spread, compute_uv=False)
     flat = extents[2] <= _FLAT * extents[0]
     if owners is None or flat:
-        return plane_poses(points, rays)
+        return solve_plane_poses(points, rays)
     groups = [np.flatnonzero(owners == owner) for owner in np.unique(owners)]
     # The largest in the image tell most.
     groups.sort(key=lambda group: -float(np.ptp(pixels[group], axis=0).prod()))
-    return [each for group in groups[:_TRIED] for each in plane_poses(points[group], rays[group])]
+    return [
+        each for group in groups[:_TRIED] for each in solve_plane_poses(points[group], rays[group])
+    ]
 
 
 def _lengths(residuals: NDArray[np.float64], deviation: float) -> NDArray[np.float64]:
@@ -260,7 +262,7 @@ def _refined(
     for _ in range(_ITERATIONS + 1):
         if any(np.vdot(rotation, other) > _SAME for other in known):
             return None
-        seen, slopes = camera.linearise(points @ rotation.T, position)
+        seen, slopes = camera.linearise_projection(points @ rotation.T, position)
         offsets = seen - pixels
         lengths = _lengths(offsets, deviation)
         loss = _misfit(lengths)

@@ -7,12 +7,12 @@ four photos of a ChArUco board, 0.19 with OpenCV's ``CharucoDetector`` and 0.14 
 rendered images of such a board at 0.25 to 0.9 m its corners are 0.06 to 0.07 pixels off, and these
 0.01 to 0.03 (``tests/tracking/camera/test_source.py``).
 
->>> from us_sim.tracking.camera.corner_refinement import refined_corners
+>>> from us_sim.tracking.camera.corner_refinement import refine_corners
 >>> image = np.full((80, 80), 200, np.uint8)
 >>> image[20:60, 25:65] = 20
 >>> image[20:60, 24] = 110  # half a pixel more
 >>> rough = np.array([[25.0, 21.0], [63.0, 20.0], [64.0, 60.0], [24.0, 59.0]])
->>> refined_corners(image, rough, cells=6).round(2)
+>>> refine_corners(image, rough, cells=6).round(2)
 array([[24. , 19.5],
        [64.5, 19.5],
        [64.5, 59.5],
@@ -41,7 +41,7 @@ _LEAST_CONTRAST = 5.0  # grey
 _LIKENESS = 0.2  # of the contrast: what may be left over, root mean square, of an edge
 
 
-def refined_corners(
+def refine_corners(
     image: NDArray[np.uint8], corners: NDArray[np.float64], cells: int
 ) -> NDArray[np.float64] | None:
     """The corners (4, 2) pixels of a marker's black square on white.
@@ -313,7 +313,7 @@ _LEAST_CROSSING_CONTRAST = 3.0  # grey, half of what is between black and white
 _CROSSING_LIKENESS = 0.25  # of that: what may be left over, root mean square
 
 
-def refined_crossing(
+def refine_crossing(
     image: NDArray[np.uint8],
     corner: NDArray[np.float64],
     directions: NDArray[np.float64],

@@ -6,7 +6,7 @@
 >>> from us_sim.tracking.camera.rigid_body import RigidBody
 >>> image = np.full((200, 200), 255, np.uint8)
 >>> image[50:150, 60:160] = cv2.aruco.generateImageMarker(dictionary("4X4_50"), 7, 100)
->>> found = FiducialDetector(RigidBody.single("4X4_50", 7, 0.04)).detect(image)
+>>> found = FiducialDetector(RigidBody.single("4X4_50", 7, 0.04)).detect_markers(image)
 >>> found.ids
 array([7])
 >>> np.allclose(found.corners[0, [0, 2]], [[59.5, 49.5], [159.5, 149.5]], atol=0.1)
@@ -21,8 +21,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.tracking.camera.corner_refinement import refined_corners, refined_crossing
-from us_sim.tracking.camera.markers import dictionary, fitted_corners, pattern
+from us_sim.tracking.camera.corner_refinement import refine_corners, refine_crossing
+from us_sim.tracking.camera.markers import compute_marker_cells, fit_corners, load_dictionary
 from us_sim.tracking.camera.rigid_body import RigidBody
 
 _SPREAD = 0.25  # of the longer extent of points: the shorter one, at least
@@ -41,7 +41,7 @@ class Detection:
     doubled: tuple[int, ...] = ()  # markers of which the image has more than one: not used
     unclear: tuple[int, ...] = ()  # markers of which a part is covered, cut or blurred: not used
 
-    def correspondences(
+    def match_points(
         self, body: RigidBody
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
         """Return points of the body (N, 3) m, of the image (N, 2) pixels, and whose they are (N,).
@@ -81,14 +81,14 @@ class FiducialDetector:
     def __init__(self, body: RigidBody) -> None:
         self.body = body
         self._parameters = cv2.aruco.DetectorParameters()
-        self._detector = cv2.aruco.ArucoDetector(dictionary(body.dictionary), self._parameters)
+        self._detector = cv2.aruco.ArucoDetector(load_dictionary(body.dictionary), self._parameters)
         self._chessboard_detector = None
         if body.chessboard is not None:
             beside = cv2.aruco.CharucoParameters()
             beside.minMarkers = 1  # a corner beside one that is found, since it is refined itself
             self._chessboard_detector = cv2.aruco.CharucoDetector(body.chessboard.board, beside)
 
-    def detect(
+    def detect_markers(
         self,
         image: NDArray[np.uint8],
         window: tuple[int, int, int, int] | None = None,
@@ -125,7 +125,7 @@ class FiducialDetector:
         places = places[wanted][first[counts == 1]]
         crossings = self._crossings(image, numbers, places)
         refined = [
-            _refine(image, each, pattern(self.body.dictionary, number))
+            _refine(image, each, compute_marker_cells(self.body.dictionary, number))
             for each, number in zip(places, numbers.tolist(), strict=True)
         ]
         sure = [i for i, each in enumerate(refined) if each is not None]
@@ -173,7 +173,7 @@ class FiducialDetector:
             sine = abs(
                 float(directions[0, 0] * directions[1, 1] - directions[0, 1] * directions[1, 0])
             )
-            place = refined_crossing(image, pixel, directions, side * sine, gap * side * sine)
+            place = refine_crossing(image, pixel, directions, side * sine, gap * side * sine)
             if place is not None:
                 kept.append(number)
                 refined.append(place)
@@ -191,7 +191,7 @@ def _refine(
     half = int(np.clip(edges.min() / 20, 1, 5))
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
     near = cv2.cornerSubPix(image, corners.copy(), (half, half), (-1, -1), stop)
-    refined = refined_corners(image, np.array(near, dtype=np.float64), len(cells) - 2)
+    refined = refine_corners(image, np.array(near, dtype=np.float64), len(cells) - 2)
     if refined is None and edges.max() <= _SMALL:
-        refined = fitted_corners(image, np.array(corners, dtype=np.float64), cells)
+        refined = fit_corners(image, np.array(corners, dtype=np.float64), cells)
     return refined

@@ -1,8 +1,8 @@
 """Markers to print at true scale, with a ruler to check the printer by.
 
->>> from us_sim.tracking.camera.marker_print import sheets
+>>> from us_sim.tracking.camera.marker_print import lay_out_sheets
 >>> from us_sim.tracking.camera.rigid_body import RigidBody
->>> sheet, = sheets(RigidBody.single("4X4_50", 7, 0.04))
+>>> sheet, = lay_out_sheets(RigidBody.single("4X4_50", 7, 0.04))
 >>> sheet.marked[0].round(1)  # mm from the paper's upper left corner
 array([[16.7, 16.7],
        [56.7, 16.7],
@@ -48,7 +48,7 @@ class Sheet:
     foot: str
 
 
-def sheets(body: RigidBody, paper: str = "A4") -> list[Sheet]:
+def lay_out_sheets(body: RigidBody, paper: str = "A4") -> list[Sheet]:
     """Lay out the sheets that show every marker of a body at true scale.
 
     A flat body is one piece on one sheet. Markers of another are printed one by one, to be cut
@@ -100,7 +100,7 @@ def print_markers(body: RigidBody, out: Path, paper: str = "A4") -> list[Sheet]:
     kind = out.suffix.lower()
     if kind not in (".pdf", ".png"):
         raise TrackingError(f"{out}: must be a file that ends in .pdf or .png")
-    pages = sheets(body, paper)
+    pages = lay_out_sheets(body, paper)
     if kind == ".png" and len(pages) > 1:
         raise TrackingError(f"{out}: the body needs {len(pages)} sheets; write a .pdf")
     content = io.BytesIO()

@@ -6,10 +6,10 @@ are changed until image and drawing differ least: Gauss-Newton with steps compos
 homography (Lucas and Kanade 1981; Baker and Matthews 2004, section 3). The residual tells whether
 all of the marker is in view.
 
->>> from us_sim.tracking.camera.markers import dictionary, square
->>> dictionary("6X6_250").bytesList.shape[0]
+>>> from us_sim.tracking.camera.markers import load_dictionary, compute_square_corners
+>>> load_dictionary("6X6_250").bytesList.shape[0]
 250
->>> square(0.04)[0]
+>>> compute_square_corners(0.04)[0]
 array([-0.02,  0.02,  0.  ])
 """
 
@@ -27,7 +27,7 @@ from us_sim.tracking.settings import DICTIONARIES
 
 
 @lru_cache(maxsize=32)
-def dictionary(name: str) -> cv2.aruco.Dictionary:
+def load_dictionary(name: str) -> cv2.aruco.Dictionary:
     """OpenCV's dictionary of a name, with or without ``DICT_``.
 
     Raises:
@@ -39,10 +39,10 @@ def dictionary(name: str) -> cv2.aruco.Dictionary:
             f"installed: run pip install 'opencv-python-headless>=4.8', where ROS 2 is with "
             f"--break-system-packages and '<4.12'"
         )
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{proper_name(name)}"))
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{normalise_name(name)}"))
 
 
-def proper_name(name: str) -> str:
+def normalise_name(name: str) -> str:
     """The name as `DICTIONARIES` writes it.
 
     Raises:
@@ -57,18 +57,18 @@ def proper_name(name: str) -> str:
     )
 
 
-def marker_count(name: str) -> int:
+def count_markers(name: str) -> int:
     """How many markers a dictionary has; they are numbered from 0."""
-    return int(dictionary(name).bytesList.shape[0])
+    return int(load_dictionary(name).bytesList.shape[0])
 
 
-def family(name: str) -> str:
+def find_largest_dictionary(name: str) -> str:
     """The largest dictionary that has all the markers of this one under the same numbers."""
     bits, _, count = name.rpartition("_")
     return f"{bits}_1000" if count.isdigit() else name
 
 
-def square(size: float) -> NDArray[np.float64]:
+def compute_square_corners(size: float) -> NDArray[np.float64]:
     """(4, 3) m: corners of a marker's black square about its middle, as OpenCV orders them.
 
     x is to its right, y up and z out of the paper, towards who looks at it; the corners are the
@@ -94,16 +94,16 @@ _COVERED = 0.5  # the same about any place: more is a hand, or another thing bef
 
 
 @lru_cache(maxsize=1024)
-def pattern(name: str, number: int) -> NDArray[np.uint8]:
+def compute_marker_cells(name: str, number: int) -> NDArray[np.uint8]:
     """(n, n) 0 or 1: cells of a marker of a dictionary, one of white about it."""
-    marker = dictionary(name)
+    marker = load_dictionary(name)
     cells = cv2.aruco.generateImageMarker(marker, number, marker.markerSize + 2)
     found = np.pad(np.asarray(cells, dtype=np.uint8) // 255, 1, constant_values=1)
     found.flags.writeable = False
     return found
 
 
-def fitted_corners(
+def fit_corners(
     image: NDArray[np.uint8], corners: NDArray[np.float64], cells: NDArray[np.uint8]
 ) -> NDArray[np.float64] | None:
     """The corners (4, 2) pixels of a marker's black square.
@@ -111,7 +111,7 @@ def fitted_corners(
     Args:
         image: (rows, columns) grey.
         corners: (4, 2) pixels, to about two pixels, in the pattern's order.
-        cells: (n, n) as `pattern` gives them.
+        cells: (n, n) as `compute_marker_cells` gives them.
 
     Returns:
         None where image and pattern differ: covered, cut, or another thing.

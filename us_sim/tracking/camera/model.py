@@ -2,10 +2,10 @@
 
 >>> from us_sim.tracking.camera.model import CameraModel
 >>> camera = CameraModel(640, 480, [[600, 0, 320], [0, 600, 240], [0, 0, 1]], [-0.2, 0, 0, 0, 0])
->>> pixels = camera.project(np.array([[0.1, 0.05, 0.5]]))
+>>> pixels = camera.project_points(np.array([[0.1, 0.05, 0.5]]))
 >>> pixels.round(2)
 array([[438.8, 299.4]])
->>> camera.rays(pixels).round(6)
+>>> camera.compute_rays(pixels).round(6)
 array([[0.2, 0.1]])
 """
 
@@ -98,11 +98,11 @@ class CameraModel:
         object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "distortion", distortion)
 
-    def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def project_points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Project points (N, 3) m to pixels (N, 2); NaN for those not before the camera."""
-        return self.linearise(points, _STILL)[0]
+        return self.linearise_projection(points, _STILL)[0]
 
-    def linearise(
+    def linearise_projection(
         self, points: NDArray[np.float64], shift: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Project shifted points, and differentiate by the shift and a rotation before it.
@@ -130,7 +130,7 @@ class CameraModel:
         pixels[~(points[:, 2] + shift[2] > 1e-9)] = np.nan
         return pixels, slopes
 
-    def rays(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    def compute_rays(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Rays x / z and y / z (N, 2) through pixels (N, 2); NaN where the lens model has
         no such point.
         """
@@ -144,7 +144,7 @@ class CameraModel:
         more = {"R": None, "P": None, "criteria": _UNDISTORTING}
         found = undistort(pixels, self.matrix, self.distortion, **more)
         rays: NDArray[np.float64] = np.array(found, dtype=np.float64).reshape(-1, 2)
-        again = self.project(np.column_stack([rays, np.ones(len(rays))]))
+        again = self.project_points(np.column_stack([rays, np.ones(len(rays))]))
         rays[~(np.abs(again - pixels[:, 0]).max(axis=1) < _ARRIVED)] = np.nan
         return rays
 

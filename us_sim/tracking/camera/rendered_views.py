@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.geometry.pose import Pose, product
+from us_sim.geometry.pose import Pose, multiply_quaternions
 from us_sim.geometry.se3 import rotation_exp
 from us_sim.kernels import njit
 from us_sim.tracking.camera.model import CameraModel
@@ -81,7 +81,7 @@ class RenderedView:
         self._sheets = _sheets(body)
         columns, rows = np.arange(camera.width + 1) - 0.5, np.arange(camera.height + 1) - 0.5
         grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-        self._rays = camera.rays(grid).reshape(camera.height + 1, camera.width + 1, 2)
+        self._rays = camera.compute_rays(grid).reshape(camera.height + 1, camera.width + 1, 2)
         self._background = _background(camera, np.random.default_rng(seed))
 
     def render(
@@ -130,7 +130,7 @@ class RenderedView:
             return [pose]
         ends = [_moved(pose, fraction * motion) for fraction in (-0.5, 0.5)]
         corners = self.body.corners.reshape(-1, 3)
-        first, last = (self.camera.project(end.apply(corners)) for end in ends)
+        first, last = (self.camera.project_points(end.transform_points(corners)) for end in ends)
         shift = np.linalg.norm(last - first, axis=1)
         longest = float(shift.max()) if np.isfinite(shift).all() else 0.0
         count = max(1, math.ceil(longest / _STEP))
@@ -140,12 +140,12 @@ class RenderedView:
         """Print the sheets that face the camera, one over the other in their order."""
         turn = pose.rotation
         for sheet in self._sheets:
-            corners = pose.apply(sheet.corners)
+            corners = pose.transform_points(sheet.corners)
             along, down = turn @ sheet.along, turn @ sheet.down
             normal = np.cross(down, along)
             if normal @ corners[0] >= 0 or corners[:, 2].min() <= 1e-3:
                 continue
-            pixels = self.camera.project(corners)
+            pixels = self.camera.project_points(corners)
             if not np.isfinite(pixels).all():
                 continue
             # The lens bends edges, outwards by less than the sheet's own size.
@@ -172,7 +172,9 @@ class RenderedView:
         self, image: NDArray[np.float32], pose: Pose, fraction: float, random: np.random.Generator
     ) -> None:
         """Draw fingers that come from one side and cover a fraction of the body's extent."""
-        corners = self.camera.project(pose.apply(self.body.corners.reshape(-1, 3)))
+        corners = self.camera.project_points(
+            pose.transform_points(self.body.corners.reshape(-1, 3))
+        )
         if not np.isfinite(corners).all():
             return
         angle = random.uniform(0, 2 * np.pi)
@@ -206,7 +208,7 @@ class RenderedView:
 
 def _moved(pose: Pose, motion: NDArray[np.float64]) -> Pose:
     """Shifted and turned about its own origin, both along the camera's axes."""
-    turned = product(rotation_exp(motion[3:]), pose.orientation)
+    turned = multiply_quaternions(rotation_exp(motion[3:]), pose.orientation)
     return Pose(pose.position + motion[:3], turned)
 
 

@@ -1,10 +1,10 @@
 """Rigid bodies of markers, and the YAML files that define them.
 
 >>> from us_sim.tracking.camera.rigid_body import RigidBody
->>> board = RigidBody.grid("6X6_1000", columns=4, rows=5, size=0.0375, separation=0.005)
+>>> board = RigidBody.create_grid("6X6_1000", columns=4, rows=5, size=0.0375, separation=0.005)
 >>> board.ids[-1], (board.corners[-1, 2] * 1e3).round(1)
 (np.int64(19), array([165. , 207.5,   0. ]))
->>> RigidBody.single("4X4_50", 50, 0.04)
+>>> RigidBody.create_single("4X4_50", 50, 0.04)
 Traceback (most recent call last):
 ...
 us_sim.errors.TrackingError: marker 50: dictionary 4X4_50 has only markers 0 to 49
@@ -23,12 +23,17 @@ from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Placement
-from us_sim.settings.choice import Choice, Chosen
+from us_sim.settings.choice import Choice, ChosenOption
 from us_sim.settings.quantity import Quantity
-from us_sim.settings.reading import Reader
+from us_sim.settings.reading import SettingsReader
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.text_files import read_yaml
-from us_sim.tracking.camera.markers import dictionary, marker_count, proper_name, square
+from us_sim.tracking.camera.markers import (
+    compute_square_corners,
+    count_markers,
+    load_dictionary,
+    normalise_name,
+)
 from us_sim.tracking.settings import MARKER_SIZE
 
 
@@ -65,7 +70,7 @@ class Chessboard:
                 f"a ChArUco board's markers ({self.size:g} m) must be smaller than its squares "
                 f"({self.square:g} m)"
             )
-        object.__setattr__(self, "dictionary", proper_name(self.dictionary))
+        object.__setattr__(self, "dictionary", normalise_name(self.dictionary))
         _require_in_dictionary(self.dictionary, self.columns * self.rows // 2 - 1)
 
     @cached_property
@@ -73,7 +78,7 @@ class Chessboard:
         """OpenCV's own object for the board."""
         size = (self.columns, self.rows)
         board = cv2.aruco.CharucoBoard(
-            size, float(self.square), float(self.size), dictionary(self.dictionary)
+            size, float(self.square), float(self.size), load_dictionary(self.dictionary)
         )
         board.setLegacyPattern(self.legacy)
         return board
@@ -83,7 +88,7 @@ class Chessboard:
         """(K, 3) m: where four squares meet, row by row."""
         return np.asarray(self.board.getChessboardCorners(), dtype=np.float64).reshape(-1, 3)
 
-    def squares(self, centres: NDArray[np.float64]) -> Print:
+    def compute_squares(self, centres: NDArray[np.float64]) -> Print:
         """The squares without their markers, of which the middles (M, 3) m are in white ones."""
         white = np.zeros((self.rows, self.columns), dtype=np.bool_)
         column, row = np.floor(centres[:, :2] / self.square).astype(int).T
@@ -112,7 +117,7 @@ class RigidBody:
     def __post_init__(self) -> None:
         ids = np.array(self.ids, dtype=np.int64)
         corners = np.array(self.corners, dtype=np.float64)
-        object.__setattr__(self, "dictionary", proper_name(self.dictionary))
+        object.__setattr__(self, "dictionary", normalise_name(self.dictionary))
         for number in ids.tolist():
             _require_in_dictionary(self.dictionary, number)
         numbers, counts = np.unique(ids, return_counts=True)
@@ -124,16 +129,16 @@ class RigidBody:
         object.__setattr__(self, "corners", corners)
 
     @classmethod
-    def single(cls, dictionary: str, number: int, size: float) -> RigidBody:
+    def create_single(cls, dictionary: str, number: int, size: float) -> RigidBody:
         """One marker; its middle is the origin, x to its right, y up and z out of the paper.
 
         Raises:
             TrackingError: there is no such marker.
         """
-        return cls(dictionary, np.array([number]), square(size)[None])
+        return cls(dictionary, np.array([number]), compute_square_corners(size)[None])
 
     @classmethod
-    def grid(
+    def create_grid(
         cls,
         dictionary: str,
         columns: int,
@@ -156,7 +161,7 @@ class RigidBody:
         return cls(dictionary, first + np.arange(columns * rows), places[:, None] + marker)
 
     @classmethod
-    def charuco(
+    def create_charuco(
         cls,
         dictionary: str,
         columns: int,
@@ -165,7 +170,7 @@ class RigidBody:
         size: float,
         legacy: bool = False,
     ) -> RigidBody:
-        """A ChArUco board of so many squares; its frame is as that of `grid`.
+        """A ChArUco board of so many squares; its frame is as that of `create_grid`.
 
         Raises:
             TrackingError: the markers are larger than squares, or the dictionary is too small.
@@ -183,8 +188,8 @@ class RigidBody:
     @cached_property
     def prints(self) -> list[Print]:
         """What is printed of it on white, each over those before."""
-        printed = [] if self.chessboard is None else [self.chessboard.squares(self.centres)]
-        marker = dictionary(self.dictionary)
+        printed = [] if self.chessboard is None else [self.chessboard.compute_squares(self.centres)]
+        marker = load_dictionary(self.dictionary)
         cells = marker.markerSize + 2
         for number, corners in zip(self.ids.tolist(), self.corners, strict=True):
             code = cv2.aruco.generateImageMarker(marker, number, cells) > 0
@@ -206,7 +211,7 @@ class RigidBody:
 
 
 def _require_in_dictionary(name: str, number: int) -> None:
-    count = marker_count(name)
+    count = count_markers(name)
     if not 0 <= number < count:
         raise TrackingError(f"marker {number}: dictionary {name} has only markers 0 to {count - 1}")
 
@@ -237,9 +242,9 @@ class GridBoard(Settings):
     separation: float = setting(MARKER_SIZE, "between markers")
     first: int = setting(_NUMBER, "number of the first marker", default=0)
 
-    def body(self, dictionary: str) -> RigidBody:
+    def create_body(self, dictionary: str) -> RigidBody:
         """The board of markers of a dictionary."""
-        return RigidBody.grid(dictionary, **asdict(self))
+        return RigidBody.create_grid(dictionary, **asdict(self))
 
 
 @dataclass(frozen=True)
@@ -254,9 +259,9 @@ class CharucoBoard(Settings):
     size: float = setting(MARKER_SIZE, "edge of a marker")
     legacy: bool = setting(description="as OpenCV before 4.6 drew it", default=False)
 
-    def body(self, dictionary: str) -> RigidBody:
+    def create_body(self, dictionary: str) -> RigidBody:
         """The board with markers of a dictionary."""
-        return RigidBody.charuco(dictionary, **asdict(self))
+        return RigidBody.create_charuco(dictionary, **asdict(self))
 
 
 _BOARDS = Choice(
@@ -277,12 +282,14 @@ class _Body(Settings):
 
     dictionary: str = setting(description="of the markers")
     markers: tuple[_Marker, ...] = setting(description="one by one", default=())
-    board: Chosen | None = setting(description="in place of markers", choice=_BOARDS, default=None)
+    board: ChosenOption | None = setting(
+        description="in place of markers", choice=_BOARDS, default=None
+    )
 
     def check(self) -> None:
         """Markers or a board."""
         if bool(self.markers) == (self.board is not None):
-            raise self.refused("markers", "give a list of markers, or a board in place of it")
+            raise self.make_error("markers", "give a list of markers, or a board in place of it")
 
 
 def read_rigid_body(path: Path | str) -> RigidBody:
@@ -299,12 +306,17 @@ def read_rigid_body(path: Path | str) -> RigidBody:
     content = read_yaml(Path(path), TrackingError)
     if not isinstance(content, Mapping):
         raise TrackingError(f"{path}: it must be a mapping with dictionary and markers or board")
-    written = Reader(str(path), error=TrackingError).read(_Body, content)
+    written = SettingsReader(str(path), error=TrackingError).read(_Body, content)
     try:
         if written.board is not None:
-            board: GridBoard | CharucoBoard = written.board.settings(_BOARDS)
-            return board.body(written.dictionary)
-        corners = np.array([each.pose.apply(square(each.size)) for each in written.markers])
+            board: GridBoard | CharucoBoard = written.board.resolve_settings(_BOARDS)
+            return board.create_body(written.dictionary)
+        corners = np.array(
+            [
+                each.pose.transform_points(compute_square_corners(each.size))
+                for each in written.markers
+            ]
+        )
         numbers = np.array([marker.id for marker in written.markers])
         return RigidBody(written.dictionary, numbers, corners)
     except TrackingError as error:

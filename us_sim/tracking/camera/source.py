@@ -6,9 +6,9 @@
 >>> source = CameraSource(camera, RigidBody.single("4X4_50", 7, 0.04))
 >>> image = np.full((480, 640), 255, np.uint8)
 >>> image[200:280, 280:360] = cv2.aruco.generateImageMarker(dictionary("4X4_50"), 7, 80)
->>> source.measure(image, 0).pose.position.round(2) + 0.0
+>>> source.measure_pose(image, 0).pose.position.round(2) + 0.0
 array([0.  , 0.  , 0.25])
->>> source.measure(np.zeros_like(image), 33_000_000)
+>>> source.measure_pose(np.zeros_like(image), 33_000_000)
 >>> source.last_problem.partition(": ")[2]
 'uncover the lens or add light'
 """
@@ -26,10 +26,15 @@ from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
-from us_sim.settings.spelling import counted
-from us_sim.tracking.camera.body_pose import CORNER_DEVIATION, BodyPose, PlaneAmbiguity, body_poses
+from us_sim.settings.spelling import format_count
+from us_sim.tracking.camera.body_pose import (
+    CORNER_DEVIATION,
+    BodyPose,
+    PlaneAmbiguity,
+    estimate_body_poses,
+)
 from us_sim.tracking.camera.fiducial_detector import Detection, FiducialDetector
-from us_sim.tracking.camera.markers import dictionary, family
+from us_sim.tracking.camera.markers import find_largest_dictionary, load_dictionary
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rigid_body import RigidBody
 from us_sim.tracking.measurement import Measurement
@@ -72,7 +77,7 @@ class CameraSource:
         self._last = None
         self._ambiguity.reset()
 
-    def measure(self, image: NDArray[np.uint8], stamp: int) -> Measurement | None:
+    def measure_pose(self, image: NDArray[np.uint8], stamp: int) -> Measurement | None:
         """The body's pose in ``camera_optical``, or None with the reason in ``last_problem``.
 
         Args:
@@ -112,15 +117,15 @@ class CameraSource:
         """The body's markers, near where they were or else anywhere."""
         near = self._near(before) if before is not None else None
         if near is not None:
-            detection = self._detector.detect(image, *near)
+            detection = self._detector.detect_markers(image, *near)
             if self._is_enough(detection):
                 return detection
         if image.size >= 4 * _SEARCHED:
             reduction = int(math.sqrt(image.size / _SEARCHED))
-            detection = self._detector.detect(image, reduction=reduction)
+            detection = self._detector.detect_markers(image, reduction=reduction)
             if self._is_enough(detection):
                 return detection
-        return self._detector.detect(image)
+        return self._detector.detect_markers(image)
 
     def _is_enough(self, detection: Detection) -> bool:
         """Whether there is no need to look further."""
@@ -131,7 +136,9 @@ class CameraSource:
 
     def _near(self, pose: Pose) -> tuple[tuple[int, int, int, int], int] | None:
         """The window around the body as it was, and by how much to reduce the image there."""
-        corners = self.camera.project(pose.apply(self.body.corners.reshape(-1, 3)))
+        corners = self.camera.project_points(
+            pose.transform_points(self.body.corners.reshape(-1, 3))
+        )
         if not np.isfinite(corners).all():
             return None
         low, high = corners.min(axis=0), corners.max(axis=0)
@@ -150,8 +157,8 @@ class CameraSource:
     def _pose(
         self, image: NDArray[np.uint8], detection: Detection, before: Pose | None
     ) -> tuple[BodyPose, NDArray[np.float64]] | None:
-        """The pose and its covariance; see `measure`."""
-        points, pixels, owners = detection.correspondences(self.body)
+        """The pose and its covariance; see `measure_pose`."""
+        points, pixels, owners = detection.match_points(self.body)
         if not len(points):
             self.last_problem = self.last_problem or self._nothing(image, detection)
             return None
@@ -163,18 +170,18 @@ class CameraSource:
             if len(markers) < least and self.body.chessboard is None:
                 count = len(markers)
                 self.last_problem = refusal or (
-                    f"{counted(count, 'marker of the body is', 'markers of the body are')} "
+                    f"{format_count(count, 'marker of the body is', 'markers of the body are')} "
                     f"seen, fewer than the {least} of camera.minimum_markers"
                 )
                 return None
-            found = body_poses(self.camera, points, pixels, owners, guess=before)
+            found = estimate_body_poses(self.camera, points, pixels, owners, guess=before)
             if not found:
                 self.last_problem = (
                     "what is seen of the body does not tell its pose: show more of it, and check "
                     "the camera info and the body's file"
                 )
                 return None
-            pose = self._ambiguity.chosen(found, before)
+            pose = self._ambiguity.choose_pose(found, before)
             unfit, refusal = self._unfit(pose, owners)
             if not len(unfit):
                 break
@@ -186,7 +193,7 @@ class CameraSource:
             self.last_problem = refusal
         board = self.body.chessboard is not None
         self.seen = len(detection.ids) + len(detection.unclear) if board else len(markers)
-        return pose, self._ambiguity.settled(found, pose, before)
+        return pose, self._ambiguity.record_choice(found, pose, before)
 
     def _unfit(self, pose: BodyPose, owners: NDArray[np.int64]) -> tuple[NDArray[np.int64], str]:
         """Owners of points that cannot be used in a pose, and why."""
@@ -224,7 +231,7 @@ class CameraSource:
         The chessboard (-1) counts as the last marker on it.
         """
         normals = self.body.normals[markers] @ pose.rotation.T
-        centres = pose.apply(self.body.centres[markers])
+        centres = pose.transform_points(self.body.centres[markers])
         cosines = -(normals * centres).sum(axis=1) / np.linalg.norm(centres, axis=1)
         return np.arccos(np.clip(cosines, -1.0, 1.0))
 
@@ -241,14 +248,14 @@ class CameraSource:
         if not others:
             return start
         listed = ", ".join(str(number) for number in others[:5])
-        markers = counted(len(others), "marker")
+        markers = format_count(len(others), "marker")
         return f"{start}, only {markers} that the body lacks ({listed}): check the body's numbers"
 
     def _others(self, image: NDArray[np.uint8]) -> list[int]:
         """Numbers of the markers in the image that are the body's but for their numbers."""
         parameters = cv2.aruco.DetectorParameters()
         parameters.errorCorrectionRate = 0.0
-        known = dictionary(family(self.body.dictionary))
+        known = load_dictionary(find_largest_dictionary(self.body.dictionary))
         ids = cv2.aruco.ArucoDetector(known, parameters).detectMarkers(image)[1]
         return [] if ids is None else np.unique(np.asarray(ids, dtype=np.int64)).tolist()
 
@@ -325,7 +332,7 @@ class VideoSource:
             rate = float(self._capture.get(cv2.CAP_PROP_FPS))
         return 1.0 / (rate if 0.01 < rate < 1e4 else _USUAL_RATE)
 
-    def grab(self) -> float | None:
+    def grab_image(self) -> float | None:
         """Wait for the next image; its age in s, or None where there is none any more.
 
         The age is 0 but for cameras under Linux, whose driver stamps what it reads.
@@ -337,7 +344,7 @@ class VideoSource:
         age = time.monotonic() - 1e-3 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
         return age if 0.0 < age < _OLDEST_S else 0.0
 
-    def pixels(self, *, grey: bool) -> NDArray[np.uint8] | None:
+    def retrieve_image(self, *, grey: bool) -> NDArray[np.uint8] | None:
         """The image that was grabbed, (rows, columns) or (rows, columns, 3) blue, green, red."""
         if self._capture is None:
             return None
@@ -361,7 +368,7 @@ def _hush() -> None:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
-def practice(body: RigidBody) -> bool:
+def practise_tracking(body: RigidBody) -> bool:
     """Track a drawn marker, or board, twice: from nowhere and from near. Whether it was found."""
     camera = CameraModel(640, 480, np.array([[600.0, 0, 319.5], [0, 600.0, 239.5], [0, 0, 1]]))
     image = np.full((480, 640), 255, dtype=np.uint8)
@@ -369,8 +376,10 @@ def practice(body: RigidBody) -> bool:
         image[40:440, 70:570] = body.chessboard.board.generateImage((500, 400))
     else:
         number = int(body.ids[0])
-        body = RigidBody.single(body.dictionary, number, 0.04)
-        marker = cv2.aruco.generateImageMarker(dictionary(body.dictionary), number, 120)
+        body = RigidBody.create_single(body.dictionary, number, 0.04)
+        marker = cv2.aruco.generateImageMarker(load_dictionary(body.dictionary), number, 120)
         image[180:300, 260:380] = marker
     source = CameraSource(camera, body)
-    return [source.measure(image, stamp) is not None for stamp in (0, 33_000_000)] == [True] * 2
+    return [source.measure_pose(image, stamp) is not None for stamp in (0, 33_000_000)] == [
+        True
+    ] * 2

@@ -7,20 +7,20 @@ from typing import Any
 from nicegui import ui
 from nicegui.elements.mixins.disableable_element import DisableableElement
 
-from us_sim.viewer.remote_parameters import NodeParameters, in_time
+from us_sim.viewer.remote_parameters import NodeParameters, await_answer
 from us_sim.viewer.session import CONTROL, SessionBoard
 from us_sim.viewer.stream import ONLY_WATCHES
 
 
-def why_not() -> str:
+def find_refusal() -> str:
     """Say why the page at work may change nothing; "" where it may."""
     request = ui.context.client.request
     return ONLY_WATCHES if request is not None and "watch" in request.query_params else ""
 
 
-def enable(control: DisableableElement, is_on: bool = True) -> None:
+def enable_control(control: DisableableElement, is_on: bool = True) -> None:
     """Let a control be used, or not; on a page that only watches never, and its title says why."""
-    reason = why_not()
+    reason = find_refusal()
     control.set_enabled(is_on and not reason)
     if reason and control.props.get("title") != reason:
         control.props["title"] = reason
@@ -28,12 +28,12 @@ def enable(control: DisableableElement, is_on: bool = True) -> None:
 
 async def set_parameter(node: NodeParameters, name: str, value: Any) -> str:
     """Set a parameter as `NodeParameters.set` does; return why it was refused, or nothing."""
-    return why_not() or await node.set(name, value)
+    return find_refusal() or await node.set_value(name, value)
 
 
 async def ask_session(board: SessionBoard, **values: object) -> str:
     """Set parameters of ``session_control``; return why it was refused, or nothing."""
-    return why_not() or await in_time(board.ask(**values), CONTROL)
+    return find_refusal() or await await_answer(board.ask_control(**values), CONTROL)
 
 
 def is_taken(refusal: str) -> bool:

@@ -1,11 +1,11 @@
 """Controls of parameters, each made from the parameter's descriptor.
 
->>> from us_sim.viewer.panels.controls import on_sliders, slider_span
->>> slider_span(-60.0, 60.0, 6.0)
+>>> from us_sim.viewer.panels.controls import resample_gains, choose_slider_span
+>>> choose_slider_span(-60.0, 60.0, 6.0)
 SliderSpan(low=-60.0, high=60.0, step=0.2, is_logarithmic=False)
->>> slider_span(1e-6, 1e10, 12.0)  # kPa
+>>> choose_slider_span(1e-6, 1e10, 12.0)  # kPa
 SliderSpan(low=0.12, high=1200.0, step=0.0, is_logarithmic=True)
->>> on_sliders((0.0, 6.0), 4)
+>>> resample_gains((0.0, 6.0), 4)
 [0.0, 2.0, 4.0, 6.0]
 """
 
@@ -22,8 +22,8 @@ from nicegui import ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
-from us_sim.viewer.panels.asking import set_parameter, why_not
-from us_sim.viewer.parameters import Kind, Parameter
+from us_sim.viewer.panels.asking import find_refusal, set_parameter
+from us_sim.viewer.parameters import Parameter, ParameterKind
 from us_sim.viewer.remote_parameters import NodeParameters
 
 
@@ -56,7 +56,7 @@ class WhileShown(Element, component="while_shown.js"):
         # A page that was away for a moment does not know that it was.
         self.client.on_connect(lambda: self.run_method("again"))
 
-    def close(self) -> None:
+    def stop_showing(self) -> None:
         """End before it is taken off the page."""
         self._show(False)
 
@@ -89,12 +89,12 @@ class SliderSpan:
     step: float  # 0 where it goes by factors
     is_logarithmic: bool
 
-    def holds(self, value: float | None) -> bool:
+    def has_value(self, value: float | None) -> bool:
         """Whether a value can be shown on it; nothing can."""
         return value is None or self.low <= value <= self.high
 
 
-def slider_span(
+def choose_slider_span(
     low: float, high: float, value: float | None, is_whole: bool = False, unit: str = ""
 ) -> SliderSpan | None:
     """The span of a slider around a value; None where no slider makes sense.
@@ -155,13 +155,13 @@ class ParameterControl(Element, component="parameter_control.js"):
         self._wanted: tuple[Any, int] | None = None  # a value, and the number of the change
         self._is_asking = False
         self._span: SliderSpan | None = None
-        self.props.update({"label": label or parameter.label, "tip": tip_of(parameter)})
-        self.props.update({"reason": "", "seen": 0, "forbidden": why_not()})
+        self.props.update({"label": label or parameter.label, "tip": describe_parameter(parameter)})
+        self.props.update({"reason": "", "seen": 0, "forbidden": find_refusal()})
         self.props["data-parameter"] = f"{parameter.node}.{parameter.name}"
         self.on("change", self._on_change)
         self._show()
 
-    def show(self, parameter: Parameter) -> None:
+    def show_parameter(self, parameter: Parameter) -> None:
         """Show another value, or another range."""
         if parameter == self.parameter:
             return
@@ -201,7 +201,7 @@ class ParameterControl(Element, component="parameter_control.js"):
                 "meanings": dict(parameter.meanings),
                 "optional": parameter.may_be_nothing,
                 "live": parameter.is_live,
-                "tip": tip_of(parameter),
+                "tip": describe_parameter(parameter),
                 "span": span,
             }
         )
@@ -210,19 +210,23 @@ class ParameterControl(Element, component="parameter_control.js"):
     def _fit(self, value: Any) -> None:
         """Have the slider cover the value, with room to go on where the range has some."""
         low, high = self.parameter.low, self.parameter.high
-        if self.parameter.kind not in (Kind.NUMBER, Kind.WHOLE) or low is None or high is None:
+        if (
+            self.parameter.kind not in (ParameterKind.NUMBER, ParameterKind.WHOLE)
+            or low is None
+            or high is None
+        ):
             self._span = None
             return
         span = self._span
         is_at_the_end = span is not None and (
             (value == span.low != low) or (value == span.high != high)
         )
-        if span is None or not span.holds(value) or is_at_the_end:
-            is_whole = self.parameter.kind is Kind.WHOLE
-            self._span = slider_span(low, high, value, is_whole, self.parameter.unit)
+        if span is None or not span.has_value(value) or is_at_the_end:
+            is_whole = self.parameter.kind is ParameterKind.WHOLE
+            self._span = choose_slider_span(low, high, value, is_whole, self.parameter.unit)
 
 
-def tip_of(parameter: Parameter) -> str:
+def describe_parameter(parameter: Parameter) -> str:
     """The description of a parameter, its range, and its full name."""
     unit = f" {parameter.unit}" if parameter.unit else ""
     said = [parameter.description] if parameter.description else []
@@ -238,12 +242,12 @@ def tip_of(parameter: Parameter) -> str:
     return "; ".join(said)
 
 
-def slider_count(gains: Sequence[float]) -> int:
+def count_sliders(gains: Sequence[float]) -> int:
     """One slider for each gain where those are 3 to 12, else 8, as consoles have."""
     return len(gains) if 2 < len(gains) <= 12 else 8
 
 
-def on_sliders(gains: Sequence[float], count: int) -> list[float]:
+def resample_gains(gains: Sequence[float], count: int) -> list[float]:
     """Gains at evenly spaced depths, linear in between, as so many sliders show them, dB."""
     if not gains:
         return [0.0] * count
@@ -252,23 +256,23 @@ def on_sliders(gains: Sequence[float], count: int) -> list[float]:
     return [round(float(gain), 6) for gain in shown]
 
 
-class TimeGain(ParameterControl, component="time_gain.js"):
+class TimeGainControl(ParameterControl, component="time_gain.js"):
     """One slider for the gain in dB at each of some depths, from the face to the beams' end."""
 
     REACH = 20.0  # dB up and down that the sliders cover, as consoles have it
 
     def __init__(self, node: NodeParameters, parameter: Parameter, label: str = "") -> None:
-        self._count = slider_count(parameter.value)
+        self._count = count_sliders(parameter.value)
         super().__init__(node, parameter, label)
-        self.reach(100.0, "%")
+        self.set_end(100.0, "%")
 
-    def reach(self, end: float, unit: str) -> None:
+    def set_end(self, end: float, unit: str) -> None:
         """The beams end at this depth."""
         names = [f"{place:.0f} {unit}" for place in np.linspace(0.0, end, self._count)]
         if names != self.props.get("depths"):
             self.props["depths"] = names
 
     def _show(self) -> None:
-        gains = on_sliders(self.parameter.value, self._count)
+        gains = resample_gains(self.parameter.value, self._count)
         low, high = min(-self.REACH, *gains), max(self.REACH, *gains)
         self.props.update({"gains": gains, "unit": self.parameter.unit, "low": low, "high": high})

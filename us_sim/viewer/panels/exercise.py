@@ -12,10 +12,10 @@ from nicegui.element import Element
 
 from us_sim.scene.listing import ListedScene
 from us_sim.scoring.settings import ANSWERS, NO_ANSWER, NO_THROMBUS, STATES
-from us_sim.viewer.panels.asking import enable, is_taken, set_parameter, why_not
+from us_sim.viewer.panels.asking import enable_control, find_refusal, is_taken, set_parameter
 from us_sim.viewer.panels.controls import WhileShown
-from us_sim.viewer.panels.session import is_sure, load_asked
-from us_sim.viewer.score import PICTURE, SCORE, is_blind, told_score
+from us_sim.viewer.panels.session import ask_to_load, is_confirmed
+from us_sim.viewer.score import PICTURE, SCORE, get_score, is_blind
 from us_sim.viewer.stream import Feed, Simulator
 
 EVERY_S = 0.5
@@ -43,8 +43,8 @@ class ExercisePanel:
 
     def __init__(self, simulator: Simulator) -> None:
         self._simulator, self._board = simulator, simulator.session
-        self._scorer = simulator.nodes.of(_SCORER)
-        self._only_watches = bool(why_not())
+        self._scorer = simulator.nodes.get_node(_SCORER)
+        self._only_watches = bool(find_refusal())
         self._watched: list[Feed] = []
         self._told: Mapping[str, Any] | None = None  # what is shown
         self._listed: tuple[object, ...] = ()  # exercises that are shown
@@ -80,26 +80,26 @@ class ExercisePanel:
         feeds = self._simulator.feeds
         self._watched = [feeds[kind] for kind in (SCORE, PICTURE) if kind in feeds]
         for feed in self._watched:
-            feed.watch(self._changed)
-        self._board.watch()
-        self._scorer.watch()
+            feed.add_watcher(self._changed)
+        self._board.add_page()
+        self._scorer.add_page()
 
     def _end(self) -> None:
         for feed in self._watched:
-            feed.unwatch(self._changed)
-        self._board.unwatch()
-        self._scorer.unwatch()
+            feed.remove_watcher(self._changed)
+        self._board.remove_page()
+        self._scorer.remove_page()
 
     def _changed(self) -> None:
         """Nothing: the panel looks twice a second."""
 
     def _drawn(self) -> bytes:
         feed = self._simulator.feeds.get(PICTURE)
-        packet = feed.newest() if feed is not None else None
+        packet = feed.get_newest() if feed is not None else None
         return packet.payload if packet is not None else b""
 
     def _refresh(self) -> None:
-        told = told_score(self._simulator)
+        told = get_score(self._simulator)
         if told != self._told:
             self._told = told
             self._show(told)
@@ -125,10 +125,10 @@ class ExercisePanel:
                 ).props("flat dense no-caps align=left")
                 button.props["title"] = f"{each.description} In {each.region.replace('_', ' ')}"
                 button.props["aria-current"] = str(is_loaded).lower()
-                enable(button, state.is_there and not state.is_busy)
+                enable_control(button, state.is_there and not state.is_busy)
 
     async def _load(self, exercise: ListedScene) -> None:
-        if await load_asked(self._simulator, exercise):
+        if await ask_to_load(self._simulator, exercise):
             self._choice.close()
 
     def _show(self, told: Mapping[str, Any]) -> None:
@@ -193,14 +193,14 @@ class ExercisePanel:
     async def _clear(self) -> None:
         name = (self._told or {}).get("name", "")
         is_running = (self._told or {}).get("state") == "running"
-        if not is_taken(why_not()):
+        if not is_taken(find_refusal()):
             return
-        if not is_running or await is_sure("Begin anew", f"It ends the attempt at {name}."):
+        if not is_running or await is_confirmed("Begin anew", f"It ends the attempt at {name}."):
             self._simulator.ask_scorer("clear")
 
     async def _draw(self) -> bool:
         """Have the picture drawn anew; whether it was."""
-        if not is_taken(why_not()):
+        if not is_taken(find_refusal()):
             return False
         feed = self._simulator.feeds[PICTURE]
         before = feed.sequence
@@ -219,11 +219,11 @@ class ExercisePanel:
             ui.button("Close", on_click=dialog.close).props("no-caps")
 
     async def _save(self) -> None:
-        from us_sim.scoring.result import result_page  # it brings scipy, which only this takes
+        from us_sim.scoring.result import render_page  # it brings scipy, which only this takes
 
         if await self._draw():
             now = datetime.now().strftime("%Y-%m-%d-%H-%M-%S")
-            page = result_page(told_score(self._simulator), self._drawn())
+            page = render_page(get_score(self._simulator), self._drawn())
             ui.download.content(page, f"us_sim-{now}.html", "text/html")
 
 
@@ -239,6 +239,6 @@ def _draw_metrics(metrics: Mapping[str, str]) -> None:
 
 
 def _address(picture: bytes) -> str:
-    from us_sim.scoring.result import picture_address
+    from us_sim.scoring.result import encode_picture
 
-    return picture_address(picture)
+    return encode_picture(picture)

@@ -10,16 +10,16 @@ from typing import Any
 from nicegui import ui
 from nicegui.element import Element
 
-from us_sim.viewer.panels.controls import TimeGain, WhileShown
+from us_sim.viewer.panels.controls import TimeGainControl, WhileShown
 from us_sim.viewer.panels.sections import (
     REFRESH_S,
-    Section,
-    arrange,
+    ParameterSection,
+    arrange_parameters,
     build_parameters,
-    title_of,
+    format_title,
 )
 from us_sim.viewer.parameters import Parameter
-from us_sim.viewer.status import HISTORY_S, Level, NodeStatus, Point
+from us_sim.viewer.status import HISTORY_S, NodeLevel, NodeStatus, Point
 from us_sim.viewer.stream import Simulator
 
 COMMON = (
@@ -47,24 +47,24 @@ Series = dict[str, list[Point]]
 
 def build_image(simulator: Simulator) -> None:
     """Make the panel of the scanner's console."""
-    console = "", "slice_interpolator", partial(arrange, first=COMMON)
-    build_parameters(simulator.nodes, console, special={"time_gain": TimeGain})
+    console = "", "slice_interpolator", partial(arrange_parameters, first=COMMON)
+    build_parameters(simulator.nodes, console, special={"time_gain": TimeGainControl})
 
 
-def arrange_tissue(parameters: Mapping[str, Parameter]) -> list[Section]:
+def arrange_tissue(parameters: Mapping[str, Parameter]) -> list[ParameterSection]:
     """Put the method first, the settings of those in use, then stiffness and blood's pressure."""
 
     def labels(ending: str, more: str = "") -> dict[str, str]:
         return {
-            name: title_of(name[len(MATERIALS) : -len(ending)]) + more
+            name: format_title(name[len(MATERIALS) : -len(ending)]) + more
             for name, parameter in parameters.items()
             if name.startswith(MATERIALS) and name.endswith(ending) and parameter.value is not None
         }
 
     stiff, pressed = labels(STIFFNESS), labels(PRESSURE, " pressure")
-    stiffness = Section("Young's modulus", tuple(stiff), stiff, is_open=True)
-    pressure = Section("Pressure of blood", tuple(pressed), pressed, is_open=True)
-    return arrange(parameters, choosing=METHOD, ahead=[stiffness, pressure])
+    stiffness = ParameterSection("Young's modulus", tuple(stiff), stiff, is_open=True)
+    pressure = ParameterSection("Pressure of blood", tuple(pressed), pressed, is_open=True)
+    return arrange_parameters(parameters, choosing=METHOD, ahead=[stiffness, pressure])
 
 
 def build_tissue(simulator: Simulator) -> None:
@@ -72,12 +72,12 @@ def build_tissue(simulator: Simulator) -> None:
     board = simulator.status
 
     def refresh() -> None:
-        notes = _tissue_notes(board.node(TISSUE, time.monotonic()))
+        notes = _tissue_notes(board.find_node(TISSUE, time.monotonic()))
         for label, text in zip(labels, notes, strict=True):
             label.set_text(text)
             label.set_visibility(bool(text))
 
-    with WhileShown(board.watch, board.unwatch, REFRESH_S, refresh):
+    with WhileShown(board.add_page, board.remove_page, REFRESH_S, refresh):
         labels = (
             ui.label().classes("us-note us-accent").props('role="status"'),
             ui.label().classes("us-note"),
@@ -86,8 +86,8 @@ def build_tissue(simulator: Simulator) -> None:
     build_parameters(
         simulator.nodes,
         ("", TISSUE, arrange_tissue),
-        ("Skin", "skin_deformer", arrange),
-        ("Tracker", "probe_tracker", partial(arrange, choosing=("filter",))),
+        ("Skin", "skin_deformer", arrange_parameters),
+        ("Tracker", "probe_tracker", partial(arrange_parameters, choosing=("filter",))),
     )
 
 
@@ -97,9 +97,9 @@ def _tissue_notes(status: NodeStatus | None) -> tuple[str, str, str]:
         return "", "", ""
     preparing = status.values.get("preparing", "")
     compared = status.values.get("compared_with", "")
-    most, mean = status.number("difference_max_mm"), status.number("difference_rms_mm")
+    most, mean = status.read_number("difference_max_mm"), status.read_number("difference_rms_mm")
     difference = ""
-    if status.level is not Level.GONE and compared and most is not None and mean is not None:
+    if status.level is not NodeLevel.GONE and compared and most is not None and mean is not None:
         difference = f"{compared} is {most:.3g} mm away at most, {mean:.3g} mm root mean square"
     is_recent = time.monotonic() - status.problem_heard < RECENT_S
     return (
@@ -115,9 +115,9 @@ def build_status(simulator: Simulator) -> None:
 
     def refresh() -> None:
         now = time.monotonic()
-        table.show(board.nodes(now), now)
+        table.show_nodes(board.list_nodes(now), now)
 
-    with WhileShown(board.watch, board.unwatch, STATUS_S, refresh):
+    with WhileShown(board.add_page, board.remove_page, STATUS_S, refresh):
         table = StatusTable(partial(_show_parameters, simulator))
 
 
@@ -130,10 +130,10 @@ def _show_parameters(simulator: Simulator, node: str) -> None:
             ui.space()
             button = ui.button(icon="close", on_click=dialog.close)
             button.props("flat round dense title=Close aria-label=Close")
-        shown = build_parameters(simulator.nodes, ("", node, arrange))
+        shown = build_parameters(simulator.nodes, ("", node, arrange_parameters))
 
     def close() -> None:
-        shown.close()
+        shown.stop_showing()
         dialog.delete()
 
     dialog.on("hide", close)
@@ -151,25 +151,25 @@ class StatusTable(Element, component="status_table.js"):
         super().__init__()
         self.on("choose", lambda event: choose(str(event.args)))
 
-    def show(self, nodes: list[NodeStatus], now: float) -> None:
+    def show_nodes(self, nodes: list[NodeStatus], now: float) -> None:
         """Show these nodes; ``now`` is s of the monotonic clock."""
-        rows = [row_of(status, now) for status in nodes]
+        rows = [make_row(status, now) for status in nodes]
         if rows != self.props.get("rows"):
             self.props["rows"] = rows
 
 
-def row_of(status: NodeStatus, now: float) -> dict[str, Any]:
+def make_row(status: NodeStatus, now: float) -> dict[str, Any]:
     """A node's row of the table, as texts."""
 
     def text(key: str, digits: int = 0) -> str:
-        number = status.number(key)
+        number = status.read_number(key)
         return "" if number is None else f"{number:.{digits}f}"
 
     def milliseconds(which: str) -> str:
-        number = status.number(f"latency_{which}_ms") or 0.0
+        number = status.read_number(f"latency_{which}_ms") or 0.0
         return text(f"latency_{which}_ms", 1 if abs(number) < 99.95 else 0)
 
-    is_wrong = status.level in (Level.WARNING, Level.ERROR)
+    is_wrong = status.level in (NodeLevel.WARNING, NodeLevel.ERROR)
     age = now - status.problem_heard
     problem = ""
     if status.problem and age <= PROBLEM_S:
@@ -178,7 +178,7 @@ def row_of(status: NodeStatus, now: float) -> dict[str, Any]:
     return {
         "name": status.name,
         "level": status.level.value,
-        "state": "silent" if status.level is Level.GONE else status.state,
+        "state": "silent" if status.level is NodeLevel.GONE else status.state,
         "rate": text("rate_hz", 1),
         "latency": " · ".join(filter(None, map(milliseconds, ("p50", "p99")))),
         "received": text("received"),
@@ -210,11 +210,11 @@ class Plot(Element, component="plot.js"):
         self._history = history
         self._told: dict[str, float] = {}
 
-    def begin(self) -> None:
+    def start_plot(self) -> None:
         """It begins to be shown, with nothing drawn."""
         self._told = {}
 
-    def refresh(self, now: float) -> None:
+    def send_points(self, now: float) -> None:
         """Send the new points; ``now`` is s of the monotonic clock."""
         is_first = not self._told
         oldest = now - HISTORY_S
@@ -234,29 +234,29 @@ def build_plots(simulator: Simulator) -> None:
     plots: list[Plot] = []
 
     def begin() -> None:
-        board.watch()
-        board.force.watch()
+        board.add_page()
+        board.force.add_page()
         for plot in plots:
-            plot.begin()
+            plot.start_plot()
 
     def end() -> None:
-        board.unwatch()
-        board.force.unwatch()
+        board.remove_page()
+        board.force.remove_page()
 
     def refresh() -> None:
         now = time.monotonic()
         for plot in plots:
-            plot.refresh(now)
+            plot.send_points(now)
 
     def force(since: float) -> Series:
         settled = time.monotonic() - HELD_BACK_S
-        points = [point for point in board.forces(since) if point[0] < settled]
+        points = [point for point in board.get_forces(since) if point[0] < settled]
         return {"probe": points} if points else {}
 
     with WhileShown(begin, end, STATUS_S, refresh):
         plots += [
-            Plot("rate", "Hz", partial(board.history, "rate_hz")),
-            Plot("latency, median", "ms", partial(board.history, "latency_p50_ms")),
+            Plot("rate", "Hz", partial(board.get_history, "rate_hz")),
+            Plot("latency, median", "ms", partial(board.get_history, "latency_p50_ms")),
             Plot("contact force", "N", force),
-            Plot("residual", "of the force", partial(board.history, "residual"), True),
+            Plot("residual", "of the force", partial(board.get_history, "residual"), True),
         ]

@@ -11,15 +11,15 @@ from dataclasses import dataclass, field
 from nicegui import ui
 from nicegui.element import Element
 
-from us_sim.viewer.panels.controls import ParameterControl, TimeGain, WhileShown
-from us_sim.viewer.parameters import Parameter, in_words
+from us_sim.viewer.panels.controls import ParameterControl, TimeGainControl, WhileShown
+from us_sim.viewer.parameters import Parameter, format_name
 from us_sim.viewer.remote_parameters import THERE, NodeParameters, RemoteParameters
 
 REFRESH_S = 0.2  # how often what is shown is brought up to date
 
 
 @dataclass(frozen=True)
-class Section:
+class ParameterSection:
     """Parameters under one title."""
 
     title: str  # without one it cannot be folded away
@@ -29,16 +29,16 @@ class Section:
     is_shown: bool = True
 
 
-Arrange = Callable[[Mapping[str, Parameter]], list[Section]]
+Arrange = Callable[[Mapping[str, Parameter]], list[ParameterSection]]
 """Puts the parameters of a node, by name, into sections."""
 
 
-def arrange(
+def arrange_parameters(
     parameters: Mapping[str, Parameter],
     first: Sequence[str] = (),
     choosing: Sequence[str] = (),
-    ahead: Sequence[Section] = (),
-) -> list[Section]:
+    ahead: Sequence[ParameterSection] = (),
+) -> list[ParameterSection]:
     """Put parameters into sections: some, the others by groups, and last those that are fixed.
 
     Args:
@@ -62,23 +62,23 @@ def arrange(
         if any(group in each.choices for each in deciding):
             is_shown = any(group == each.value for each in deciding)
             title = f"Settings of {group}"
-            chosen.append(Section(title, tuple(names), is_shown=is_shown))
+            chosen.append(ParameterSection(title, tuple(names), is_shown=is_shown))
         else:
-            others.append(Section(title_of(group) or "More", tuple(names)))
-    fixed = {name: in_words(name) for name in parameters if name not in live}
-    last = Section("Given at the start", tuple(fixed), fixed)
-    sections = [Section("", tuple(top)), *chosen, *ahead, *others, last]
+            others.append(ParameterSection(format_title(group) or "More", tuple(names)))
+    fixed = {name: format_name(name) for name in parameters if name not in live}
+    last = ParameterSection("Given at the start", tuple(fixed), fixed)
+    sections = [ParameterSection("", tuple(top)), *chosen, *ahead, *others, last]
     return [section for section in sections if section.names]
 
 
-def title_of(group: str) -> str:
+def format_title(group: str) -> str:
     """Write the title of a group of parameters."""
-    words = in_words(group)
+    words = format_name(group)
     return words[:1].upper() + words[1:]
 
 
 class ParameterSections:
-    """Shows a node's parameters; `refresh` brings them up to date.
+    """Shows a node's parameters; `refresh_sections` brings them up to date.
 
     Args:
         node: whose parameters are shown.
@@ -98,7 +98,7 @@ class ParameterSections:
         self._state = ui.label().classes("us-note").props('role="status"')
         self._body = ui.element("div").classes("us-sections")
 
-    def refresh(self) -> None:
+    def refresh_sections(self) -> None:
         """Show what is known now."""
         state, parameters = seen = self.node.state, self.node.parameters
         if self._seen is not None and state == self._seen[0] and parameters is self._seen[1]:
@@ -125,10 +125,10 @@ class ParameterSections:
             if box.visible != section.is_shown:
                 box.set_visibility(section.is_shown)
         for name, control in self._controls.items():
-            control.show(parameters[name])
+            control.show_parameter(parameters[name])
         self._name_depths()
 
-    def _build(self, section: Section) -> Element:
+    def _build(self, section: ParameterSection) -> Element:
         """Make a section, with its controls if it is open."""
         box: Element
 
@@ -163,8 +163,8 @@ class ParameterSections:
     def _name_depths(self) -> None:
         """Have the sliders of the time gain reach to the depth of the image."""
         gains, depth = self._controls.get("time_gain"), self.node.parameters.get("depth")
-        if isinstance(gains, TimeGain) and depth is not None:
-            gains.reach(float(depth.value), depth.unit)
+        if isinstance(gains, TimeGainControl) and depth is not None:
+            gains.set_end(float(depth.value), depth.unit)
 
 
 def build_parameters(
@@ -183,19 +183,19 @@ def build_parameters(
 
     def begin() -> None:
         for each in made:
-            each.node.watch()
+            each.node.add_page()
 
     def end() -> None:
         for each in made:
-            each.node.unwatch()
+            each.node.remove_page()
 
     def refresh() -> None:
         for each in made:
-            each.refresh()
+            each.refresh_sections()
 
     with WhileShown(begin, end, REFRESH_S, refresh) as shown:
         for title, name, arrangement in wanted:
             if title:
                 ui.label(title).classes("us-heading").props('role="heading" aria-level="2"')
-            made.append(ParameterSections(nodes.of(name), arrangement, special or {}))
+            made.append(ParameterSections(nodes.get_node(name), arrangement, special or {}))
     return shown

@@ -11,9 +11,9 @@ from typing import Any
 from nicegui import ui
 
 from us_sim.scene.listing import ListedScene
-from us_sim.viewer.panels.asking import ask_session, enable, is_taken
+from us_sim.viewer.panels.asking import ask_session, enable_control, is_taken
 from us_sim.viewer.panels.controls import WhileShown
-from us_sim.viewer.score import told_score
+from us_sim.viewer.score import get_score
 from us_sim.viewer.session import NOT_THERE, SessionState
 from us_sim.viewer.stream import Simulator
 
@@ -29,7 +29,7 @@ class CasesPanel:
     def __init__(self, simulator: Simulator) -> None:
         self._simulator, self._board = simulator, simulator.session
         self._shown: tuple[object, ...] = ()
-        with WhileShown(self._board.watch, self._board.unwatch, EVERY_S, self._refresh):
+        with WhileShown(self._board.add_page, self._board.remove_page, EVERY_S, self._refresh):
             self._state = ui.label().classes("us-session-state").props('role="status"')
             self._bar = ui.linear_progress(0.0, show_value=False, color="primary")
             self._bar.props('aria-label="Loading"')
@@ -90,28 +90,28 @@ class CasesPanel:
             with ui.row().classes("us-case-foot"):
                 ui.label("loaded" if is_loaded else "").classes("us-accent")
                 label = "Load again" if is_loaded else "Load"
-                button = ui.button(label, on_click=lambda: load_asked(self._simulator, scene))
+                button = ui.button(label, on_click=lambda: ask_to_load(self._simulator, scene))
                 button.props("flat dense no-caps").props["aria-label"] = f"{label} {scene.name}"
                 button.props["title"] = AGAIN if is_loaded else ANOTHER
-                enable(button, state.is_there and not state.is_busy and not scene.problem)
+                enable_control(button, state.is_there and not state.is_busy and not scene.problem)
 
 
-async def load_asked(simulator: Simulator, scene: ListedScene) -> bool:
+async def ask_to_load(simulator: Simulator, scene: ListedScene) -> bool:
     """Load a scene, and ask first where something ends with the one that runs.
 
     Returns:
         whether it is loaded.
     """
-    record, score = simulator.session.state.record, told_score(simulator)
+    record, score = simulator.session.state.record, get_score(simulator)
     ends = [f"the recording {record}, which is kept as it is"] if record else []
     ends += [f"the attempt at {score['name']}"] if score.get("state") == "running" else []
     sentence = f"Loading {scene.name} ends {', and '.join(ends)}."
-    if ends and not await is_sure("Load", sentence):
+    if ends and not await is_confirmed("Load", sentence):
         return False
     return is_taken(await ask_session(simulator.session, scene=scene.origin))
 
 
-async def is_sure(what: str, sentence: str) -> bool:
+async def is_confirmed(what: str, sentence: str) -> bool:
     """Ask before something ends; whether that shall be."""
     with ui.dialog() as dialog, ui.card():
         dialog.props["aria-label"] = what
@@ -150,7 +150,7 @@ class SessionPanel:
         self._is_following = False  # while controls are set to what is so
         self._shown_record = ""  # the recording whose name the field shows
         self._proposed = _proposed()
-        with WhileShown(self._board.watch, self._board.unwatch, EVERY_S, self._refresh):
+        with WhileShown(self._board.add_page, self._board.remove_page, EVERY_S, self._refresh):
             self._absent = ui.label(NOT_THERE).classes("us-quiet")
             with ui.column().classes("us-session") as self._all:
                 self._problem = ui.label().classes("us-session-problem").props('role="alert"')
@@ -207,7 +207,7 @@ class SessionPanel:
         self._time.on("change", self._seek)
         self._where = ui.label().classes("us-quiet").props('role="status"')
         for control in (self._file, self._record, self._bag, self._play, self._rate, self._loop):
-            enable(control)
+            enable_control(control)
 
     def _refresh(self) -> None:
         board, state = self._board, self._board.state
@@ -221,10 +221,10 @@ class SessionPanel:
                 self._file.set_value(PurePath(state.record).name)
             else:
                 self._propose()
-        enable(self._file, not state.record)
-        enable(self._record, not state.record and state.replay_as == "path")
-        enable(self._stop, bool(state.record))
-        told, is_short = recorded(state) if state.is_recording else ("", False)
+        enable_control(self._file, not state.record)
+        enable_control(self._record, not state.record and state.replay_as == "path")
+        enable_control(self._stop, bool(state.record))
+        told, is_short = describe_recording(state) if state.is_recording else ("", False)
         begun = "recording to" if state.is_recording else f"{state.record_state}:"
         self._recorded.set_text(f"{begun} {state.record}{told}" if state.record else "")
         self._recorded.classes(**{"add" if is_short else "remove": "us-wrong"})
@@ -243,8 +243,8 @@ class SessionPanel:
         is_running = plays and state.is_playing
         self._play.set_icon("pause" if is_running else "play_arrow")
         for control in (self._close, self._time):
-            enable(control, plays)
-        enable(self._kind, not plays)
+            enable_control(control, plays)
+        enable_control(self._kind, not plays)
         fixed = "While something is replayed this cannot be changed: end the replay first"
         self._kind_told.props["title"] = fixed if plays else KINDS_TOLD
         end = round(state.duration, 2)
@@ -331,12 +331,12 @@ class SessionPanel:
         return is_taken(refused)
 
 
-def recorded(state: SessionState) -> tuple[str, bool]:
+def describe_recording(state: SessionState) -> tuple[str, bool]:
     """How long, how large, and how much longer it may become; and whether that is little.
 
-    >>> recorded(SessionState(record_seconds=72.0, record_bytes=3.6e8, record_room_bytes=9e9))
+    >>> describe_recording(SessionState(record_seconds=72.0, record_bytes=3.6e8, record_room_bytes=9e9))
     (': 1:12 min, 360 MB, room for 30 min', False)
-    >>> recorded(SessionState(record_seconds=10.0, record_bytes=1e9, record_room_bytes=5e9))
+    >>> describe_recording(SessionState(record_seconds=10.0, record_bytes=1e9, record_room_bytes=5e9))
     (': 0:10 min, 1.0 GB, room for 1 min', True)
     """
     seconds, size, room = state.record_seconds, state.record_bytes, state.record_room_bytes

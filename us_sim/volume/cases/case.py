@@ -22,9 +22,9 @@ import platformdirs
 from numpy.typing import NDArray
 
 from us_sim.errors import CaseError, UsSimError
-from us_sim.settings.reading import Reader
+from us_sim.settings.reading import SettingsReader
 from us_sim.settings.registry import PROBES
-from us_sim.settings.spelling import aligned, unknown
+from us_sim.settings.spelling import align_columns, describe_unknown
 from us_sim.settings.text_files import read_yaml
 from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.files.readers import open_image, read_placement, read_volume
@@ -48,7 +48,7 @@ class Case:
         """Tell whether it is segmented."""
         return (self.folder / LABELS).is_file()
 
-    def placement(self) -> tuple[NDArray[np.float64], tuple[int, int, int]]:
+    def read_placement(self) -> tuple[NDArray[np.float64], tuple[int, int, int]]:
         """Read where its voxels are from the header alone: (4, 4) m from indices, and the shape.
 
         Raises:
@@ -57,7 +57,7 @@ class Case:
         path = self.folder / VOLUME
         return read_placement(path), open_image(path).shape
 
-    def volume(self) -> Volume:
+    def read_volume(self) -> Volume:
         """Read grey values in the volume's own frame, and labels and their names if there are any.
 
         Raises:
@@ -91,7 +91,7 @@ class Case:
             CaseError: they differ, or the labels are not 8-bit.
             VolumeError: a header cannot be used.
         """
-        placement, shape = self.placement()
+        placement, shape = self.read_placement()
         labels = open_image(self.folder / LABELS)
         if labels.type.itemsize != 1:
             raise CaseError(
@@ -131,17 +131,17 @@ def read_case(folder: str | os.PathLike[str]) -> Case:
     document = read_yaml(path, CaseError)
     if document is None:
         raise CaseError(f"{path}: is empty; a case has at least a name")
-    return Case(folder, Reader(str(path), None, CaseError).read(CaseSettings, document))
+    return Case(folder, SettingsReader(str(path), None, CaseError).read(CaseSettings, document))
 
 
-def case_roots() -> list[Path]:
+def list_case_roots() -> list[Path]:
     """Return folders of cases; of several that have a name the first is taken."""
     given = os.environ.get("US_SIM_CASES", "")
     roots = [Path(os.path.expanduser(part)) for part in given.split(os.pathsep) if part]
     return roots or [platformdirs.user_data_path("us_sim") / "cases"]
 
 
-def cases_in(root: Path) -> list[Path]:
+def find_cases(root: Path) -> list[Path]:
     """Return the folders in a folder that have a ``case.yaml``, by name; itself where it is a case.
 
     Raises:
@@ -157,7 +157,7 @@ def cases_in(root: Path) -> list[Path]:
 
 
 def find_case(name: str | os.PathLike[str], folders: Sequence[Path] = ()) -> Path:
-    """Find the folder of a case, by its path or by its name in one of `case_roots`.
+    """Find the folder of a case, by its path or by its name in one of `list_case_roots`.
 
     Args:
         name: of the case, or its folder.
@@ -168,16 +168,16 @@ def find_case(name: str | os.PathLike[str], folders: Sequence[Path] = ()) -> Pat
     """
     path = Path(os.path.expanduser(name))
     places = [folder / path for folder in (*folders, Path.cwd())] if str(name) else []
-    roots = [root for root in case_roots() if root.is_dir()]
-    named = {case.name: case for root in reversed(roots) for case in cases_in(root)}
+    roots = [root for root in list_case_roots() if root.is_dir()]
+    named = {case.name: case for root in reversed(roots) for case in find_cases(root)}
     for case in (*filter(is_case, places), *([named[str(name)]] if str(name) in named else [])):
         return case.resolve()
     if any(place.exists() for place in places):
         raise CaseError(f"{name}: is no case, as it has no {CASE}; `us-sim cases` lists some")
     if not named:
-        where = ", ".join(map(str, case_roots()))
+        where = ", ".join(map(str, list_case_roots()))
         raise CaseError(f"there is no case {name}, and none at all in {where}")
-    raise CaseError(f"there is no such case: {unknown(str(name), sorted(named))}")
+    raise CaseError(f"there is no such case: {describe_unknown(str(name), sorted(named))}")
 
 
 class ListedCase(NamedTuple):
@@ -191,11 +191,11 @@ class ListedCase(NamedTuple):
     problem: str = ""  # why it cannot be used
 
 
-def listed(folder: Path) -> ListedCase:
+def list_case(folder: Path) -> ListedCase:
     """Collect the facts of the case in a folder, from its texts and headers alone."""
     try:
         case = read_case(folder)
-        matrix, shape = case.placement()
+        matrix, shape = case.read_placement()
         if case.has_labels:
             case.check_grids()
     except UsSimError as error:
@@ -205,7 +205,7 @@ def listed(folder: Path) -> ListedCase:
     sides = sorted({f"{side:.2g}" for side in voxel})
     settings, shown = case.settings, ""
     if settings.probe is not None:
-        array: Any = settings.probe.array.settings(PROBES)
+        array: Any = settings.probe.array.resolve_settings(PROBES)
         shown = f"{settings.probe.geometry}, {array.depth * 1e3:.0f} mm deep"
     return ListedCase(
         folder.name,
@@ -216,12 +216,12 @@ def listed(folder: Path) -> ListedCase:
     )
 
 
-def table(cases: Sequence[ListedCase]) -> str:
+def format_cases(cases: Sequence[ListedCase]) -> str:
     """Lay out cases in columns, and under them the problems of those that cannot be used."""
     rows = [case[:-1] for case in cases if not case.problem]
     titles = ("case", "region", "probe", "size", "structures")
     cut = [[text if len(text) <= 60 else f"{text[:60]}..." for text in row] for row in rows]
-    lines = aligned([titles, *cut], left=range(len(titles))) if rows else []
+    lines = align_columns([titles, *cut], left=range(len(titles))) if rows else []
     return "\n".join(
         [*lines, *(f"cannot be used: {case.problem}" for case in cases if case.problem)]
     )

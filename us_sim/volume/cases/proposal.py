@@ -22,11 +22,11 @@ from scipy.spatial.transform import Rotation
 from us_sim.errors import CaseError
 from us_sim.geometry.pose import Placement, Pose
 from us_sim.geometry.transducer import ProbeSettings
-from us_sim.settings.choice import Chosen
+from us_sim.settings.choice import ChosenOption
 from us_sim.settings.registry import COLLIDERS, PROBES
-from us_sim.tissue.elasticity.material import LAYERS, kind_of
+from us_sim.tissue.elasticity.material import LAYERS, guess_tissue_kind
 from us_sim.volume.cases.settings import CaseSettings, CaseStart
-from us_sim.volume.volume import Volume, grid_extent
+from us_sim.volume.volume import Volume, compute_grid_extent
 
 _MOST_POINTS = 1_000_000
 _SLID, _SHOWN = 4e-3, 6e-3
@@ -35,7 +35,7 @@ _FLAT = 0.01  # m, in the middle of a curved face, that counts as flat
 _BETTER = 1.02  # times as much in the image, for which another pose is preferred
 
 
-def with_proposal(settings: CaseSettings, volume: Volume) -> CaseSettings:
+def complete_settings(settings: CaseSettings, volume: Volume) -> CaseSettings:
     """Propose a start, a probe and its collider for a case that says none.
 
     A start that was proposed is proposed anew.
@@ -58,13 +58,13 @@ def with_proposal(settings: CaseSettings, volume: Volume) -> CaseSettings:
         start = CaseStart(at.position, at.orientation, proposed=True)
     probe = probe or _probe_at(start.pose, points)
     if probe.collider is None:
-        probe = dataclasses.replace(probe, collider=proposed_collider(probe.array))
+        probe = dataclasses.replace(probe, collider=propose_collider(probe.array))
     return dataclasses.replace(settings, start=start, probe=probe)
 
 
-def proposed_collider(array: Chosen) -> Chosen:
+def propose_collider(array: ChosenOption) -> ChosenOption:
     """The shape of a probe's head around its array, as large as the usual ones are."""
-    given: Any = array.settings(PROBES)
+    given: Any = array.resolve_settings(PROBES)
     if array.name == "convex":
         chord = 2 * given.radius * math.sin(given.opening_angle / 2)
         name, size = "convex", {"radius": given.radius, "length": round(chord + 0.011, 4)}
@@ -72,8 +72,8 @@ def proposed_collider(array: Chosen) -> Chosen:
     else:
         name, size = "rounded_box", {"length": getattr(given, "aperture", 0.02) + 0.006}
         size |= {"width": 0.014, "height": 0.04, "rounding": 0.004}
-    kind: Any = COLLIDERS.settings(name)
-    return Chosen(name, kind(**size))
+    kind: Any = COLLIDERS.load_settings(name)
+    return ChosenOption(name, kind(**size))
 
 
 def _pose_above(points: NDArray[np.float64], volume: Volume) -> Pose:
@@ -91,8 +91,8 @@ def _probe_at(pose: Pose, points: NDArray[np.float64]) -> ProbeSettings:
     x, _, z = np.abs((points - pose.position) @ pose.rotation).T
     depth = float(np.clip(np.percentile(z, 99.5), 0.01, 0.11))
     aperture = float(np.clip(2 * np.percentile(x, 99.0), 5e-3, 0.05))
-    made: Any = PROBES.settings("linear")
-    array = Chosen("linear", made(aperture=aperture, depth=round(depth, 4)))
+    made: Any = PROBES.load_settings("linear")
+    array = ChosenOption("linear", made(aperture=aperture, depth=round(depth, 4)))
     return ProbeSettings(array=array, image=512)
 
 
@@ -101,14 +101,14 @@ def on_skin(start: Placement, volume: Volume, probe: ProbeSettings | None) -> Pl
 
     Specks, below which there is mostly nothing within 2 mm, do not hold it off.
     """
-    array: Any = probe and probe.array.settings(PROBES)
+    array: Any = probe and probe.array.resolve_settings(PROBES)
     half, pose = getattr(array, "aperture", _FLAT) / 2, start.pose
     matrix = pose.inverse().matrix @ volume.index_to_patient
     step = 0.5 * float(np.linalg.norm(matrix[:3, :3], axis=0).min())
-    shallowest, deepest = grid_extent(matrix, volume.shape)[:, 2].tolist()
+    shallowest, deepest = compute_grid_extent(matrix, volume.shape)[:, 2].tolist()
     depths = np.arange(shallowest, deepest, step)
     rays = np.meshgrid(np.linspace(-half, half, 21), [-2e-3, 0.0, 2e-3], depths, indexing="ij")
-    places = pose.apply(np.stack(rays, axis=-1).reshape(-1, 3))
+    places = pose.transform_points(np.stack(rays, axis=-1).reshape(-1, 3))
     to_index = volume.patient_to_index
     index = np.rint(places @ to_index[:3, :3].T + to_index[:3, 3]).astype(np.int64)
     scanned = np.asarray(((index >= 0) & (index < volume.shape)).all(axis=1))
@@ -118,7 +118,9 @@ def on_skin(start: Placement, volume: Volume, probe: ProbeSettings | None) -> Pl
     is_skin = lines[:, : behind.shape[1]] & (behind.mean(axis=2) > 0.5)
     touched = np.flatnonzero(is_skin.any(axis=0))
     depth = depths[touched[0]] if len(touched) else 0.0
-    x, y, z = (round(float(value), 5) for value in pose.apply(np.array([[0.0, 0.0, depth]]))[0])
+    x, y, z = (
+        round(float(value), 5) for value in pose.transform_points(np.array([[0.0, 0.0, depth]]))[0]
+    )
     return Placement((x, y, z), start.orientation)
 
 
@@ -129,12 +131,12 @@ def _showing_most(
     labels = [
         structure.label
         for name, structure in settings.structures.items()
-        if kind_of(name) not in (*LAYERS, "bone")
+        if guess_tissue_kind(name) not in (*LAYERS, "bone")
     ]
     best, most = poses[len(poses) // 2], 0.0
     if volume.labels is None or not labels:
         return best
-    array: Any = probe.array.settings(PROBES)
+    array: Any = probe.array.resolve_settings(PROBES)
     structures = _places(volume, np.isin(volume.labels, labels))
     ends = len(poses) // 10  # beside which nothing was seen
     for pose in poses[ends : len(poses) - ends]:

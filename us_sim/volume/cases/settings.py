@@ -10,9 +10,9 @@ from us_sim.geometry.pose import Placement
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-from us_sim.settings.spelling import shown, unknown
-from us_sim.tissue.elasticity.material import KINDS, Material, kind_of
-from us_sim.volume.structure_names import Colour, anatomical_colour
+from us_sim.settings.spelling import describe_unknown, short_repr
+from us_sim.tissue.elasticity.material import KINDS, Material, guess_tissue_kind
+from us_sim.volume.structure_names import Colour, choose_colour
 
 AROUND = "tissue"  # name of what is in no structure: label 0, or all of a volume without labels
 
@@ -26,16 +26,16 @@ RESERVED = (AROUND, *_FACES)  # names that no structure has
 def check_name(name: str) -> str | None:
     """The problem with the name of a case or of a structure, which become names of files."""
     if not name.strip() or len(name) > _LONGEST_NAME or not name.isprintable():
-        return f"{shown(name)}: a name has 1 to {_LONGEST_NAME} printable characters"
+        return f"{short_repr(name)}: a name has 1 to {_LONGEST_NAME} printable characters"
     if set(name) & set('/\\:*?"<>|') or name.startswith(".") or name != name.strip():
-        return f"{shown(name)}: a name is no path: use letters, digits, blanks, - and _"
+        return f"{short_repr(name)}: a name is no path: use letters, digits, blanks, - and _"
     return None
 
 
 def _material(given: Material | str | None, name: str) -> Material:
     if isinstance(given, Material):
         return given
-    return KINDS[given if given is not None else kind_of(name)]
+    return KINDS[given if given is not None else guess_tissue_kind(name)]
 
 
 @dataclass(frozen=True)
@@ -124,17 +124,17 @@ class CaseSettings(Settings):
     def check(self) -> None:
         """Names are names, and no two structures are one label."""
         if problem := check_name(self.name):
-            raise self.refused("name", problem)
+            raise self.make_error("name", problem)
         seen: dict[int, str] = {}
         for name, structure in self.structures.items():
             if problem := check_name(name):
-                raise self.refused("structures", problem)
+                raise self.make_error("structures", problem)
             if name in RESERVED:
-                raise self.refused(
+                raise self.make_error(
                     f"structures.{name}", "means something else already: choose another name"
                 )
             if structure.label in seen:
-                raise self.refused(
+                raise self.make_error(
                     f"structures.{name}.label",
                     f"{structure.label} is `{seen[structure.label]}` already: merge the two, or "
                     f"give one of them a label of its own",
@@ -142,7 +142,9 @@ class CaseSettings(Settings):
             seen[structure.label] = name
         for i, name in enumerate(self.fixed):
             if name not in (*_FACES, *self.structures):
-                raise self.refused(f"fixed[{i}]", unknown(name, (*_FACES, *self.structures)))
+                raise self.make_error(
+                    f"fixed[{i}]", describe_unknown(name, (*_FACES, *self.structures))
+                )
 
     def material_of(self, name: str) -> Material:
         """Elastic constants of a structure, or of the tissue around them all (`AROUND`)."""
@@ -152,7 +154,7 @@ class CaseSettings(Settings):
 
     def colour_of(self, name: str) -> Colour:
         """Red, green and blue of a structure."""
-        return self.structures[name].colour or anatomical_colour(name)
+        return self.structures[name].colour or choose_colour(name)
 
     @property
     def held(self) -> tuple[str, ...]:

@@ -16,9 +16,9 @@ from pathlib import Path
 import yaml
 
 from us_sim.errors import CaseError, VolumeError
-from us_sim.settings.reading import document_of
+from us_sim.settings.reading import dump_settings
 from us_sim.volume.cases.case import CASE, read_case
-from us_sim.volume.cases.proposal import with_proposal
+from us_sim.volume.cases.proposal import complete_settings
 from us_sim.volume.cases.settings import CaseSettings, check_name
 from us_sim.volume.partial_file import partial_file
 
@@ -60,7 +60,7 @@ def write_case_settings(folder: Path, settings: CaseSettings) -> None:
     Raises:
         CaseError: it cannot be written.
     """
-    document = document_of(settings)
+    document = dump_settings(settings)
     text = yaml.safe_dump(
         document, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100
     )
@@ -75,11 +75,11 @@ def _finish(folder: Path, partial: Path) -> None:
     """
     try:
         case = read_case(partial)
-        case.placement()
+        case.read_placement()
         if case.has_labels:
             case.check_grids()
         start = case.settings.start
         if start is None or start.proposed or case.settings.probe is None:
-            write_case_settings(partial, with_proposal(case.settings, case.volume()))
+            write_case_settings(partial, complete_settings(case.settings, case.read_volume()))
     except (CaseError, VolumeError) as error:
         raise type(error)(str(error).replace(str(partial), str(folder))) from error

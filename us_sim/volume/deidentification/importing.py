@@ -22,20 +22,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.deidentification.settings import ImportSettings, Rectangle
+from us_sim.volume.deidentification.settings import ImportSettings, PixelRectangle
 from us_sim.volume.files.dicom.header import (
-    dicom_files,
+    find_dicom_files,
     is_dicom,
-    items,
-    number,
-    refuse_other,
-    text,
+    no_image_error,
+    read_items,
+    read_number,
+    read_text,
 )
 from us_sim.volume.files.dicom.pixels import ImageFormat
-from us_sim.volume.files.dicom.placed_images import opened_images, placed_images
+from us_sim.volume.files.dicom.placed_images import open_images, place_images
 from us_sim.volume.files.labels import refuse_segments
 from us_sim.volume.files.readers import ENDINGS, open_image
-from us_sim.volume.files.stored_image import grey_voxels, volume_of_slices
+from us_sim.volume.files.stored_image import read_grey_voxels, stack_slices
 from us_sim.volume.files.writing import VOLUME_ENDINGS, write_volume
 from us_sim.volume.partial_file import partial_file
 from us_sim.volume.volume import Volume
@@ -44,7 +44,7 @@ Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class ImageSource:
     """Images of one volume, as they come."""
 
     shape: tuple[int, int, int]  # columns, rows, images
@@ -52,23 +52,23 @@ class Source:
     images: Callable[[NDArray[np.bool_] | None], Iterator[NDArray[np.uint8]]]
     conversions: tuple[str, ...]  # of the stored values
     placement: NDArray[np.float64]  # (4, 4) m, from (column, row, image)
-    regions: Sequence[Rectangle] = ()  # of echoes, as the header says
+    regions: Sequence[PixelRectangle] = ()  # of echoes, as the header says
     doubt: str = ""  # why it states none, of images that may show a name outside them
 
 
 @dataclass(frozen=True, eq=False)
-class Import:
+class ImportPlan:
     """Files that were looked at, and the result that is planned."""
 
     path: Path  # the first of them
     out: Path | None
-    source: Source
-    part: Rectangle  # of every image that is cut out
-    regions: tuple[Rectangle, ...]  # all else in it becomes black; none: nothing does
+    source: ImageSource
+    part: PixelRectangle  # of every image that is cut out
+    regions: tuple[PixelRectangle, ...]  # all else in it becomes black; none: nothing does
     undecided: str = ""  # what a person has to say before anything can be written
 
     @property
-    def said(self) -> str:
+    def summary(self) -> str:
         """What is made and blanked, and what nobody looked at, for a person."""
         columns, rows, count = (*self.part.size, self.source.shape[2])
         steps = np.linalg.norm(self.source.placement[:3, :3], axis=0) * 1e3
@@ -114,7 +114,7 @@ class Import:
             raise VolumeError(f"--crop {self.part}: a volume needs two columns and rows or more")
         placement = self.source.placement.copy()
         placement[:, 3] = placement @ [self.part.left, self.part.top, 0.0, 1.0]
-        volume = Volume(volume_of_slices(self._images(progress), count), placement)
+        volume = Volume(stack_slices(self._images(progress), count), placement)
         if out.name.lower().endswith(VOLUME_ENDINGS):
             write_volume(out, volume)
             return
@@ -140,9 +140,9 @@ class Import:
                 progress(done / count, f"{done} of {count} images")
 
 
-def look_at(
+def plan_import(
     files: Sequence[str | os.PathLike[str]], out: Path | None, settings: ImportSettings
-) -> Import:
+) -> ImportPlan:
     """Plan an import, and write nothing.
 
     Args:
@@ -160,7 +160,7 @@ def look_at(
     for each in map(Path, files):
         if not each.exists():
             raise VolumeError(f"{each}: there is no such file")
-        paths += dicom_files(each) if each.is_dir() else [each]
+        paths += find_dicom_files(each) if each.is_dir() else [each]
     if out is not None and os.path.lexists(out):
         raise VolumeError(f"{out}: exists already; choose another name, or remove it")
     if out and 1 < len(out.suffix) <= 5 and not out.name.lower().endswith(VOLUME_ENDINGS):
@@ -170,12 +170,12 @@ def look_at(
         )
     path, source = paths[0], _source(paths, settings)
     columns, rows, _ = source.shape
-    whole = Rectangle(0, 0, columns - 1, rows - 1)
+    whole = PixelRectangle(0, 0, columns - 1, rows - 1)
     part = settings.part or whole
-    if part.common(whole) != part:
+    if part.intersect(whole) != part:
         raise VolumeError(f"--crop {part}: is larger than the images, which are {whole}")
     regions = () if settings.keep_whole_image else source.regions
-    shown = tuple(filter(None, map(part.common, regions)))
+    shown = tuple(filter(None, map(part.intersect, regions)))
     if regions and not shown:
         raise VolumeError(
             f"--crop {part}: shows nothing of the ultrasound regions "
@@ -189,42 +189,42 @@ def look_at(
             f"holds echoes ({source.doubt}); look at it with --picture FILE, then give "
             f"--crop X0,Y0,X1,Y1, or --keep-whole-image if there is nothing to hide"
         )
-    return Import(path, out, source, part, shown, undecided)
+    return ImportPlan(path, out, source, part, shown, undecided)
 
 
-def _source(paths: list[Path], settings: ImportSettings) -> Source:
+def _source(paths: list[Path], settings: ImportSettings) -> ImageSource:
     """Open one MetaImage, NRRD or NIfTI volume, whose images are the slices, or DICOM files."""
     spacing = settings.spacing_mm
     others = [path for path in paths if path.name.lower().endswith(ENDINGS)]
     if len(paths) == 1 and others:
         image = open_image(paths[0], layers=True)
         refuse_segments(paths[0], image.texts)
-        image.check()
+        image.require_volume()
         placement = image.placement(spacing or None)
-        voxels, said = grey_voxels(image, settings.volume)
-        return Source(image.shape, lambda _: iter(voxels.transpose(2, 1, 0)), said, placement)
+        voxels, said = read_grey_voxels(image, settings.volume)
+        return ImageSource(image.shape, lambda _: iter(voxels.transpose(2, 1, 0)), said, placement)
     if strange := [*others, *(path for path in paths if not is_dicom(path))]:
-        raise refuse_other(
+        raise no_image_error(
             strange[0],
             "is no DICOM file; give DICOM files of one series, or one MHA, NRRD or NIfTI volume",
         )
     return _of_dicom(paths, settings.volume, spacing)
 
 
-def _of_dicom(paths: Sequence[Path], volume: int, spacing: tuple[float, ...]) -> Source:
+def _of_dicom(paths: Sequence[Path], volume: int, spacing: tuple[float, ...]) -> ImageSource:
     """Open the images of DICOM files of one series."""
-    images = opened_images(paths)
-    placed = placed_images(images, volume, spacing)
+    images = open_images(paths)
+    placed = place_images(images, volume, spacing)
     conversions = list(images.conversions)
     if placed.volumes > 1:
         conversions.append(f"volume {volume} of {placed.volumes} in time")
     regions, doubt = _ultrasound_regions(images.files[0], images.form)
     if any(_ultrasound_regions(file, images.form)[0] != regions for file in images.files):
         regions, doubt = [], "the files have different ultrasound regions"
-    burned = any(text(file, "BurnedInAnnotation") == "YES" for file in images.files)
-    return Source(
+    burned = any(read_text(file, "BurnedInAnnotation") == "YES" for file in images.files)
+    return ImageSource(
         (images.form.columns, images.form.rows, len(placed.which)),
-        lambda keep: images.images(placed.which, keep),
+        lambda keep: images.read_images(placed.which, keep),
         tuple(conversions),
         placed.placement,
         regions,
@@ -232,21 +232,21 @@ def _of_dicom(paths: Sequence[Path], volume: int, spacing: tuple[float, ...]) ->
     )
 
 
-def _ultrasound_regions(header: Any, form: ImageFormat) -> tuple[list[Rectangle], str]:
+def _ultrasound_regions(header: Any, form: ImageFormat) -> tuple[list[PixelRectangle], str]:
     """Return the regions of echoes; none, with the reason, if one of the header's cannot be."""
     kept = []
-    for region in items(header, "SequenceOfUltrasoundRegions"):
+    for region in read_items(header, "SequenceOfUltrasoundRegions"):
         keys = ("MinX0", "MinY0", "MaxX1", "MaxY1")
-        found = [number(region, f"RegionLocation{key}") for key in keys]
+        found = [read_number(region, f"RegionLocation{key}") for key in keys]
         edges = [-1 if each is None else int(each) for each in found]
         # Some scanners write the first column beyond a region as its last.
         ends = (form.columns - 1, form.rows - 1)
-        part = Rectangle(edges[0], edges[1], *map(min, edges[2:], ends))
+        part = PixelRectangle(edges[0], edges[1], *map(min, edges[2:], ends))
         is_within = edges[2] <= form.columns and edges[3] <= form.rows
         if min(edges) < 0 or min(part.size) < 1 or not is_within:
             doubt = f"a region is {edges} in an image of {form.columns} × {form.rows} pixels"
             return [], doubt
-        kinds = number(region, "RegionSpatialFormat"), number(region, "RegionDataType")
+        kinds = read_number(region, "RegionSpatialFormat"), read_number(region, "RegionDataType")
         if kinds in ((1, 1), (1, 2)):  # two-dimensional, of tissue or of colour flow
             kept.append(part)
     return kept, "" if kept else "there is no ultrasound region of tissue or flow"

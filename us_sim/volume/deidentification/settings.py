@@ -11,7 +11,7 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
 
-class Rectangle(NamedTuple):
+class PixelRectangle(NamedTuple):
     """From a first column and row to last ones that belong to it, as in DICOM's regions."""
 
     left: int
@@ -29,10 +29,10 @@ class Rectangle(NamedTuple):
         """Of (rows, columns)."""
         return slice(self.top, self.bottom + 1), slice(self.left, self.right + 1)
 
-    def common(self, other: Rectangle) -> Rectangle | None:
+    def intersect(self, other: PixelRectangle) -> PixelRectangle | None:
         """Return the part that both have; None where they have none."""
         first, last = map(max, self[:2], other[:2]), map(min, self[2:], other[2:])
-        made = Rectangle(*first, *last)
+        made = PixelRectangle(*first, *last)
         return made if min(made.size) > 0 else None
 
     def __str__(self) -> str:
@@ -65,9 +65,9 @@ class ImportSettings(Settings):
         """Refuse a crop that is no rectangle, and a spacing that is none."""
         if self.crop is not None and (self.part is None or min(self.part.size) < 1):
             why = "is no rectangle with a pixel; write X0,Y0,X1,Y1, the last ones included"
-            raise self.refused("crop", why)
+            raise self.make_error("crop", why)
         if self.spacing is not None and not self.spacing_mm:
-            raise self.refused("spacing", "is no three numbers of mm; write 0.3,0.3,1")
+            raise self.make_error("spacing", "is no three numbers of mm; write 0.3,0.3,1")
 
     @property
     def spacing_mm(self) -> tuple[float, ...]:
@@ -79,7 +79,7 @@ class ImportSettings(Settings):
         return found if len(found) == 3 and all(1e-4 <= each <= 100 for each in found) else ()
 
     @property
-    def part(self) -> Rectangle | None:
+    def part(self) -> PixelRectangle | None:
         """The rectangle that is kept."""
         words = re.fullmatch(r"\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)\s*", self.crop or "")
-        return Rectangle(*map(int, words.groups())) if words else None
+        return PixelRectangle(*map(int, words.groups())) if words else None

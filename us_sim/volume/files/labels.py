@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from us_sim.errors import VolumeError
-from us_sim.settings.spelling import counted, shown
+from us_sim.settings.spelling import format_count, short_repr
 from us_sim.volume.files.readers import open_image
 from us_sim.volume.files.stored_image import StoredImage
-from us_sim.volume.structure_names import Colour, is_anatomical, readable
+from us_sim.volume.structure_names import Colour, is_anatomical, make_readable
 from us_sim.volume.volume import LabelMap, Volume
 
 _MOST = 255
@@ -39,7 +39,7 @@ class Segment:
     colour: Colour | None  # red, green, blue, 0 to 1
 
 
-def segments_of(path: Path, pairs: Mapping[str, str]) -> list[Segment]:
+def parse_segments(path: Path, pairs: Mapping[str, str]) -> list[Segment]:
     """Return the segments that a header's keys and values describe, in their order; often none.
 
     Several segments share a layer as long as they do not overlap; in a layer each has a number.
@@ -49,7 +49,7 @@ def segments_of(path: Path, pairs: Mapping[str, str]) -> list[Segment]:
     for key in ("Segmentation_MasterRepresentation", "Segmentation_SourceRepresentation"):
         if (said := pairs.get(key, "Binary labelmap")).lower() != "binary labelmap":
             raise VolumeError(
-                f"{path}: holds segments as {shown(said)}; save it with `Binary labelmap` as the "
+                f"{path}: holds segments as {short_repr(said)}; save it with `Binary labelmap` as the "
                 f"source representation"
             )
     found: dict[int, dict[str, str]] = {}
@@ -63,8 +63,8 @@ def segments_of(path: Path, pairs: Mapping[str, str]) -> list[Segment]:
         layer = fields.get("Layer", "0" if shared else f"{at}")
         if not (value.isdecimal() and int(value) and layer.isdecimal()):
             raise VolumeError(
-                f"{path}: its Segment{number} has the LabelValue {shown(value)} and the Layer "
-                f"{shown(layer)}, where numbers belong, from 1 and 0 on; save it again"
+                f"{path}: its Segment{number} has the LabelValue {short_repr(value)} and the Layer "
+                f"{short_repr(layer)}, where numbers belong, from 1 and 0 on; save it again"
             )
         segments.append(
             Segment(
@@ -120,12 +120,14 @@ def read_labels(
     path = Path(path)
     remarks: list[str] = []
     image = open_image(path, layers=True)
-    segments, layers = segments_of(path, image.texts), _layers(path, image)
+    segments, layers = parse_segments(path, image.texts), _layers(path, image)
     if segments:
         labels, known = _from_segments(path, layers, segments, remarks)
     else:
         labels, known = _from_values(path, layers, remarks)
-    labels, moved = on_grid(path, labels, image.placement(), like.shape, like.index_to_patient)
+    labels, moved = resample_labels(
+        path, labels, image.placement(), like.shape, like.index_to_patient
+    )
     there = {int(label) for label in _values_in(labels)} - {0}
     gone = [_plain(known[label][0], label) for label in known if label not in there]
     if gone:
@@ -171,7 +173,9 @@ def _from_segments(
         overlap += int(np.count_nonzero(labels[inside]))
         labels[inside] = label
     if overlap:
-        remarks.append(f"segments overlap in {counted(overlap, 'voxel')}, now of the later one")
+        remarks.append(
+            f"segments overlap in {format_count(overlap, 'voxel')}, now of the later one"
+        )
     return labels, known
 
 
@@ -184,7 +188,7 @@ def _from_values(
     values = values[values != 0]  # and none is below
     if len(layers) > 1 or len(values) > _MOST:
         raise VolumeError(
-            f"{path}: holds {len(values)} different values and {counted(len(layers), 'number')} "
+            f"{path}: holds {len(values)} different values and {format_count(len(layers), 'number')} "
             f"per voxel, so it is no label image; labels are one, and {_MOST} at most"
         )
     labels = stored
@@ -205,7 +209,7 @@ def _values_in(stored: NDArray[np.generic]) -> NDArray[np.generic]:
 
 def _plain(name: str, label: int) -> str:
     """Return a name that may be said and kept."""
-    return readable(name).lower() if is_anatomical(name) else f"structure {label}"
+    return make_readable(name).lower() if is_anatomical(name) else f"structure {label}"
 
 
 def _names(
@@ -233,7 +237,7 @@ def _names(
     return names, said
 
 
-def on_grid(
+def resample_labels(
     path: Path,
     labels: NDArray[np.uint8],
     placement: NDArray[np.float64],

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.placement import checked_placement, millimetres
+from us_sim.volume.files.placement import make_placement, to_millimetres
 from us_sim.volume.files.stored_image import StoredImage, StoredNumbers
 
 _TYPES = {
@@ -27,7 +27,7 @@ _TYPES = {
 """MetaImage's element types (MetaIO, metaTypes.h)."""
 
 
-def metaimage_header(path: Path) -> tuple[dict[str, str], int]:
+def read_metaimage_header(path: Path) -> tuple[dict[str, str], int]:
     """Read the fields of a header, and the bytes it takes; ElementDataFile ends it."""
     fields: dict[str, str] = {}
     with path.open("rb") as file:
@@ -44,7 +44,9 @@ def metaimage_header(path: Path) -> tuple[dict[str, str], int]:
     )
 
 
-def metaimage_numbers(path: Path, fields: Mapping[str, str], header_bytes: int) -> StoredNumbers:
+def describe_metaimage_numbers(
+    path: Path, fields: Mapping[str, str], header_bytes: int
+) -> StoredNumbers:
     """Describe the numbers behind a header."""
     channels = int(_numbers(path, fields, 1, "ElementNumberOfChannels", default="1")[0])
     count = len(fields.get("DimSize", "").split())
@@ -71,16 +73,16 @@ def metaimage_numbers(path: Path, fields: Mapping[str, str], header_bytes: int) 
     )
 
 
-def metaimage_image(path: Path) -> StoredImage:
+def open_metaimage(path: Path) -> StoredImage:
     """Describe the image of a header."""
-    fields, header_bytes = metaimage_header(path)
-    numbers = metaimage_numbers(path, fields, header_bytes)
+    fields, header_bytes = read_metaimage_header(path)
+    numbers = describe_metaimage_numbers(path, fields, header_bytes)
     count = len(fields["DimSize"].split())
 
     def placement(given: ArrayLike | None = None) -> NDArray[np.float64]:
         """(4, 4) m of the first three axes; the matrix has one axis after another."""
         no_turn = " ".join(map(str, np.eye(count).ravel()))
-        unit = millimetres(path, fields.get("DistanceUnits", "mm"))
+        unit = to_millimetres(path, fields.get("DistanceUnits", "mm"))
         spacing, origin, axes = (
             _numbers(path, fields, length, *keys, default=default)
             for length, keys, default in (
@@ -91,7 +93,7 @@ def metaimage_image(path: Path) -> StoredImage:
         )
         stated = None if np.isnan(spacing).all() else unit * spacing[:3]
         direction = axes.reshape(count, count).T[:3, :3]
-        return checked_placement(path, stated, direction, unit * origin[:3], given)
+        return make_placement(path, stated, direction, unit * origin[:3], given)
 
     components = numbers.size[0] if len(numbers.size) > count else 1
     return StoredImage(path, numbers.size, numbers.type, components, placement, numbers.read)

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.placement import checked_placement, is_right_angled
+from us_sim.volume.files.placement import is_right_angled, make_placement
 from us_sim.volume.files.stored_image import StoredImage
 
 _TO_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])  # NIfTI's x goes to the right, its y to the front
 _OF_TWO_SIZES = 1e-2  # by which the sizes of voxels may differ that a header states twice
 
 
-def nifti_image(path: Path) -> StoredImage:
+def open_nifti(path: Path) -> StoredImage:
     """Describe the image of a file, or of a pair of ``.hdr`` and ``.img``, each packed or not."""
     import nibabel  # which takes half a second
 
@@ -86,6 +86,6 @@ def _placement(path: Path, image: Any, given: ArrayLike | None = None) -> NDArra
     placed = _TO_LPS @ matrix
     lengths = np.linalg.norm(placed[:3, :3], axis=0)
     direction = placed[:3, :3] / np.where(lengths > 0.0, lengths, 1.0)
-    return checked_placement(
+    return make_placement(
         path, None if spacing is None else unit * spacing, direction, unit * placed[:3, 3], given
     )

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.placement import checked_placement, millimetres
+from us_sim.volume.files.placement import make_placement, to_millimetres
 from us_sim.volume.files.stored_image import StoredImage, StoredNumbers
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
@@ -32,7 +32,7 @@ _TO_LPS |= {"lps": (1, 1, 1), "ras": (-1, -1, 1), "las": (1, -1, 1)}
 _DIRECTIONS = "space directions"
 
 
-def nrrd_header(path: Path) -> tuple[dict[str, Any], int]:
+def read_nrrd_header(path: Path) -> tuple[dict[str, Any], int]:
     """Parse a header: its fields and keys, as pynrrd has them, and the bytes up to its voxels."""
     try:
         with path.open("rb") as file:
@@ -46,7 +46,7 @@ def nrrd_header(path: Path) -> tuple[dict[str, Any], int]:
         ) from error
 
 
-def nrrd_numbers(path: Path, fields: Mapping[str, Any], start: int) -> StoredNumbers:
+def describe_nrrd_numbers(path: Path, fields: Mapping[str, Any], start: int) -> StoredNumbers:
     """Describe the numbers behind a header that ends at byte ``start``.
 
     They are not read by pynrrd, which takes the first of several members of gzip, as IGSIO writes.
@@ -71,10 +71,10 @@ def nrrd_numbers(path: Path, fields: Mapping[str, Any], start: int) -> StoredNum
     return StoredNumbers(size, number, file, path, start, skip, _UNPACK[encoding])
 
 
-def nrrd_image(path: Path) -> StoredImage:
+def open_nrrd(path: Path) -> StoredImage:
     """Describe an image, whose first axis may be numbers of a voxel and whose last one volumes."""
-    fields, start = nrrd_header(path)
-    numbers = nrrd_numbers(path, fields, start)
+    fields, start = read_nrrd_header(path)
+    numbers = describe_nrrd_numbers(path, fields, start)
     count = len(numbers.size)
     for key in (_DIRECTIONS, "kinds", "spacings", "units", "axis mins"):
         if len(entries := fields.get(key, numbers.size)) != count:
@@ -122,13 +122,13 @@ def _placement(
         )
     if _DIRECTIONS not in fields:
         units = fields.get("units", [""] * (axes[-1] + 1))
-        scale = np.array([millimetres(path, units[n]) for n in axes])
+        scale = np.array([to_millimetres(path, units[n]) for n in axes])
         stated = np.asarray(fields.get("spacings", np.full(axes[-1] + 1, np.nan)))[axes] * scale
         starts = np.asarray(fields.get("axis mins", np.zeros(axes[-1] + 1)))[axes]
         spacing = None if np.isnan(stated).all() else stated
-        return checked_placement(path, spacing, np.eye(3), np.nan_to_num(starts) * scale, given)
+        return make_placement(path, spacing, np.eye(3), np.nan_to_num(starts) * scale, given)
     to_lps = np.array(_TO_LPS[space], np.float64)
-    to_lps *= [millimetres(path, unit) for unit in fields.get("space units", [""] * 3)]
+    to_lps *= [to_millimetres(path, unit) for unit in fields.get("space units", [""] * 3)]
     steps = np.asarray(fields[_DIRECTIONS])[axes].T
     origin = np.asarray(fields.get("space origin", np.zeros(3)))
     if steps.shape != (3, 3) or origin.shape != (3,):
@@ -136,4 +136,4 @@ def _placement(
     steps = steps * to_lps[:, None]
     spacing = np.linalg.norm(steps, axis=0)
     direction = steps / np.where(spacing > 0.0, spacing, 1.0)
-    return checked_placement(path, spacing, direction, origin * to_lps, given)
+    return make_placement(path, spacing, direction, origin * to_lps, given)

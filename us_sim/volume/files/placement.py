@@ -18,7 +18,7 @@ _FARTHEST = 1e5  # mm
 _RIGHT_ANGLE = 1e-3  # cosine between axes, of files read and written; rounding makes 2e-4
 
 
-def millimetres(path: Path | str, unit: str) -> float:
+def to_millimetres(path: Path | str, unit: str) -> float:
     """Return the millimetres of a unit that a header names; an empty name means millimetres."""
     name = unit.strip().lower()
     for known in (name, name.removesuffix("s").replace("metre", "meter")):
@@ -34,13 +34,13 @@ def is_right_angled(direction: NDArray[np.float64]) -> bool:
     return bool(np.abs(direction.T @ direction - np.eye(3)).max() <= _RIGHT_ANGLE)
 
 
-def degrees_off(direction: NDArray[np.float64]) -> float:
+def measure_skew(direction: NDArray[np.float64]) -> float:
     """Return by how many degrees the farthest two axes are off a right angle."""
     cosines = np.abs(np.triu(direction.T @ direction, 1)).max()
     return float(np.degrees(np.arcsin(min(cosines, 1.0))))
 
 
-def checked_placement(
+def make_placement(
     path: Path | str,
     spacing: ArrayLike | None,
     direction: ArrayLike,
@@ -80,7 +80,7 @@ def checked_placement(
     elif not abs(np.linalg.det(along)) > 1e-6:
         problem = "a direction matrix that is singular or not finite"
     elif not is_right_angled(along):
-        problem = f"axes that are {degrees_off(along):.2g}° off a right angle (sheared)"
+        problem = f"axes that are {measure_skew(along):.2g}° off a right angle (sheared)"
     elif np.abs(lengths - 1.0).max() > _RIGHT_ANGLE:
         problem = "axes that are scaled by its direction matrix"
     else:

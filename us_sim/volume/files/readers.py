@@ -23,18 +23,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.dicom.header import dicom_files, is_dicom, refuse_other
-from us_sim.volume.files.metaimage import metaimage_header, metaimage_image
-from us_sim.volume.files.nifti import nifti_image
-from us_sim.volume.files.nrrd import nrrd_header, nrrd_image
-from us_sim.volume.files.stored_image import StoredImage, grey_voxels
+from us_sim.volume.files.dicom.header import find_dicom_files, is_dicom, no_image_error
+from us_sim.volume.files.metaimage import open_metaimage, read_metaimage_header
+from us_sim.volume.files.nifti import open_nifti
+from us_sim.volume.files.nrrd import open_nrrd, read_nrrd_header
+from us_sim.volume.files.stored_image import StoredImage, read_grey_voxels
 from us_sim.volume.volume import Volume
 
 if TYPE_CHECKING:
     from us_sim.volume.files.dicom.placed_images import PlacedImages
 
-_READERS = {"mha": metaimage_image, "mhd": metaimage_image, "nrrd": nrrd_image, "nhdr": nrrd_image}
-_READERS |= {"nii": nifti_image, "hdr": nifti_image, "img": nifti_image}
+_READERS = {"mha": open_metaimage, "mhd": open_metaimage, "nrrd": open_nrrd, "nhdr": open_nrrd}
+_READERS |= {"nii": open_nifti, "hdr": open_nifti, "img": open_nifti}
 
 ENDINGS = (*(f".{ending}" for ending in _READERS), ".nii.gz", ".hdr.gz", ".img.gz")
 """Of the files of these formats; all others are DICOM, or none."""
@@ -57,9 +57,9 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
     """
     path = Path(path)
     if placed := _placed_dicom(path):
-        return Volume(placed.voxels(), placed.placement)
+        return Volume(placed.read_voxels(), placed.placement)
     image, placement = _placed(path)
-    return Volume(grey_voxels(image)[0], placement)
+    return Volume(read_grey_voxels(image)[0], placement)
 
 
 def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
@@ -82,14 +82,14 @@ def open_image(path: Path, *, layers: bool = False) -> StoredImage:
     if not path.is_file():
         raise VolumeError(f"{path}: there is no such file")
     if not path.name.lower().endswith(ENDINGS):
-        raise refuse_other(
+        raise no_image_error(
             path, "cannot be read as an image; give an MHA, NRRD, NIfTI or DICOM volume"
         )
     ending = path.name.lower().removesuffix(".gz").rpartition(".")[2]
-    if _READERS[ending] is not nifti_image and (use := sequence_use(path)):
+    if _READERS[ending] is not open_nifti and (use := describe_sequence(path)):
         raise VolumeError(f"{path}: is no volume but {use}")
     image = _READERS[ending](path)
-    image.check(layers=layers)
+    image.require_volume(layers=layers)
     return image
 
 
@@ -107,9 +107,9 @@ def is_sequence(kinds: Iterable[str], keys: Iterable[str]) -> bool:
     return len(described) > 1 or any(match[2].endswith("Transform") for match in frames)
 
 
-def sequence_use(path: Path) -> str | None:
+def describe_sequence(path: Path) -> str | None:
     """Say what a MetaImage or NRRD file of a sequence is, and its use; None of other files."""
-    keys, kinds, sizes, _ = sequence_header(path)
+    keys, kinds, sizes, _ = read_sequence_header(path)
     if not is_sequence(kinds, keys) or (len(sizes) == 4 and sizes[2] != 1 and sizes[0]):
         return None  # several volumes in time are no sequence of flat images
     frames = [match for match in map(FRAME_KEY.match, keys) if match]
@@ -122,13 +122,13 @@ def sequence_use(path: Path) -> str | None:
     return f"a sequence of tracked frames; give it to `us-sim reconstruct {path.name}`"
 
 
-def sequence_header(path: Path) -> tuple[dict[str, Any], list[str], list[int], int]:
+def read_sequence_header(path: Path) -> tuple[dict[str, Any], list[str], list[int], int]:
     """Read a MetaImage or NRRD header: keys, kinds and lengths of axes, and its length in bytes."""
     if path.name.lower().endswith((".nrrd", ".nhdr")):
-        keys, start = nrrd_header(path)
+        keys, start = read_nrrd_header(path)
         kinds = [kind.lower() for kind in keys.get("kinds", ())]
         return keys, kinds, [int(length) for length in keys.get("sizes", ())], start
-    keys, start = metaimage_header(path)
+    keys, start = read_metaimage_header(path)
     try:
         sizes = [int(word) for word in keys.get("DimSize", "").split()]
     except ValueError:
@@ -152,6 +152,6 @@ def _placed_dicom(path: Path) -> PlacedImages | None:
     named = path.name.lower().endswith(ENDINGS)
     if not path.is_dir() and (named or not path.is_file() or not is_dicom(path)):
         return None
-    from us_sim.volume.files.dicom.placed_images import opened_images, placed_images
+    from us_sim.volume.files.dicom.placed_images import open_images, place_images
 
-    return placed_images(opened_images(dicom_files(path) if path.is_dir() else [path]))
+    return place_images(open_images(find_dicom_files(path) if path.is_dir() else [path]))

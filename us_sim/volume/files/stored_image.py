@@ -69,7 +69,7 @@ def check_memory(needed: float, purpose: str, advice: str = "end other programs"
     Raises:
         VolumeError: it does.
     """
-    free = free_memory()
+    free = measure_free_memory()
     if needed > free:
         raise VolumeError(
             f"{purpose} takes {needed / 1e9:.3g} GB of memory where {free / 1e9:.3g} GB are free: "
@@ -114,7 +114,7 @@ def check_brightness(path: Path | str, image: NDArray[Any]) -> None:
         )
 
 
-def free_memory() -> float:
+def measure_free_memory() -> float:
     """Bytes of memory that programs may still take, as Linux estimates it; elsewhere no limit."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
@@ -154,7 +154,7 @@ class StoredImage:
         """How many volumes there are one after another."""
         return self.axes[3] if len(self.axes) == 4 else 1
 
-    def check(self, *, layers: bool = False) -> None:
+    def require_volume(self, *, layers: bool = False) -> None:
         """Refuse an image that is no volume, or does not fit into memory.
 
         With ``layers`` a voxel may have several numbers, as in segmentations of 3D Slicer.
@@ -184,7 +184,7 @@ class GreyLevels:
     high: float = 255.0
 
     @classmethod
-    def over(cls, path: Path | str, images: Iterable[NDArray[Any]]) -> GreyLevels:
+    def find_levels(cls, path: Path | str, images: Iterable[NDArray[Any]]) -> GreyLevels:
         """Find the levels of images (rows, columns), read once; errors name the path."""
         low, high = math.inf, -math.inf
         for number, image in enumerate(images):
@@ -208,7 +208,9 @@ class GreyLevels:
         return np.asarray(np.floor(level * 255.0 + 0.5).astype(np.uint8))
 
 
-def grey_voxels(image: StoredImage, volume: int = 1) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
+def read_grey_voxels(
+    image: StoredImage, volume: int = 1
+) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
     """Read the grey values (i, j, k) of one of an image's volumes; say how they came about."""
     if not 1 <= volume <= image.volumes:
         raise VolumeError(
@@ -222,14 +224,14 @@ def grey_voxels(image: StoredImage, volume: int = 1) -> tuple[NDArray[np.uint8],
 
     levels = GreyLevels()
     if stored.dtype != np.uint8:
-        levels = GreyLevels.over(image.path, slices())
+        levels = GreyLevels.find_levels(image.path, slices())
         said.append(f"{8 * image.type.itemsize}-bit values spread over 0 to 255")
     if image.volumes > 1:
         said.append(f"volume {volume} of {image.volumes}")
-    return volume_of_slices(map(levels, slices()), stored.shape[2]), tuple(said)
+    return stack_slices(map(levels, slices()), stored.shape[2]), tuple(said)
 
 
-def volume_of_slices(slices: Iterable[NDArray[np.uint8]], count: int) -> NDArray[np.uint8]:
+def stack_slices(slices: Iterable[NDArray[np.uint8]], count: int) -> NDArray[np.uint8]:
     """A volume (i, j, k) of slices (j, i), of which so many come.
 
     The first is read before memory is taken for all.

@@ -14,9 +14,9 @@ import SimpleITK as sitk
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.placement import degrees_off, is_right_angled
+from us_sim.volume.files.placement import is_right_angled, measure_skew
 from us_sim.volume.partial_file import partial_file
-from us_sim.volume.structure_names import Colour, anatomical_colour
+from us_sim.volume.structure_names import Colour, choose_colour
 from us_sim.volume.volume import Volume
 
 VOLUME_ENDINGS = (".nrrd", ".mha", ".nii.gz", ".nii")
@@ -57,7 +57,7 @@ def write_labels(
     Args:
         path: ends in .seg.nrrd, .nrrd, .mha, .nii or .nii.gz.
         volume: with labels; a label without a name is called by its number.
-        colours: red, green and blue from 0 to 1 by label; `anatomical_colour` where not given.
+        colours: red, green and blue from 0 to 1 by label; `choose_colour` where not given.
     """
     path = Path(path)
     if volume.labels is None:
@@ -82,7 +82,7 @@ def _segment_fields(
     }
     for number, label in enumerate(wanted):
         name = names.get(label, f"label {label}")
-        colour = colours.get(label) or anatomical_colour(name)
+        colour = colours.get(label) or choose_colour(name)
         fields |= {
             f"Segment{number}_ID": f"Segment_{label}",
             f"Segment{number}_Name": name,
@@ -110,7 +110,7 @@ def _write_image(
     direction = matrix[:3, :3] / spacing
     if not is_right_angled(direction):
         raise VolumeError(
-            f"{path}: the volume's axes are {degrees_off(direction):.2g}° off a right angle, which "
+            f"{path}: the volume's axes are {measure_skew(direction):.2g}° off a right angle, which "
             f"image files cannot hold; resample it on a grid with right angles"
         )
     ending = next((end for end in VOLUME_ENDINGS if path.name.lower().endswith(end)), None)

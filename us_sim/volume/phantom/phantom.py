@@ -1,7 +1,7 @@
 """Procedural phantoms: labelled ultrasound volumes made from a seed, and cached.
 
->>> from us_sim.volume.phantom.phantom import upper_arm
->>> arm = upper_arm(seed=1, voxel_size=2e-3)
+>>> from us_sim.volume.phantom.phantom import make_upper_arm
+>>> arm = make_upper_arm(seed=1, voxel_size=2e-3)
 >>> arm.shape, arm.label_names[6]
 ((36, 30, 27), 'vein')
 """
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from us_sim.cache import cache_folder, kept
+from us_sim.cache import cache_folder, load_or_create
 from us_sim.errors import VolumeError
 from us_sim.settings.registry import PHANTOMS
 from us_sim.volume.settings import SEED, VOXEL_SIZE
@@ -30,7 +30,7 @@ _GENERATOR = 2
 bytes."""
 
 
-def upper_arm(
+def make_upper_arm(
     seed: int = 1,
     voxel_size: float = 0.3e-3,
     progress: Progress | None = None,
@@ -56,7 +56,7 @@ def upper_arm(
         UPPER_ARM_BLOCK,
         PointSpread,
         UpperArm,
-        echo_envelope,
+        compute_envelope,
         log_compress,
     )
 
@@ -71,7 +71,7 @@ def upper_arm(
     lower[2] = UPPER_ARM_BLOCK[0, 2]
     spread = PointSpread()
     depth = np.arange(shape[2]) * voxel_size
-    margin = np.ceil(np.array(spread.reach(depth)) / voxel_size).astype(int)
+    margin = np.ceil(np.array(spread.compute_reach(depth)) / voxel_size).astype(int)
     x, y, z = (
         lower[axis] + (np.arange(-margin[axis], shape[axis] + margin[axis]) + 0.5) * voxel_size
         for axis in range(3)
@@ -85,14 +85,14 @@ def upper_arm(
     # Products of matrices this small take five times as long on several threads.
     with threadpool_limits(1, user_api="blas"):
         for j, at in enumerate(y):
-            section = arm.section(x, float(at), z)
+            section = arm.cut_section(x, float(at), z)
             labels[:, j], diffuse[:, j] = section.labels, section.diffuse
             specular[:, j] = section.specular
             if j % 10 == 0:
                 report(0.8 * j / len(y), "laying out the tissue")
     report(0.8, "scattering")
     random = np.random.Generator(np.random.PCG64([seed, 1]))
-    envelope = echo_envelope(diffuse, specular, voxel_size, z, spread, random)
+    envelope = compute_envelope(diffuse, specular, voxel_size, z, spread, random)
     del diffuse, specular
     report(0.95, "compressing")
     placement = np.diag([voxel_size, voxel_size, voxel_size, 1.0])
@@ -107,27 +107,25 @@ def upper_arm(
     return volume
 
 
-thrombosed_arm = partial(upper_arm, thrombus=(-9e-3, 9e-3))
+thrombosed_arm = partial(make_upper_arm, thrombus=(-9e-3, 9e-3))
 
 
-def drawn_arm(
-    seed: int = 1, voxel_size: float = 0.3e-3, progress: Progress | None = None
-) -> Volume:
+def draw_arm(seed: int = 1, voxel_size: float = 0.3e-3, progress: Progress | None = None) -> Volume:
     """Make an arm whose seed decides, too, whether a thrombus is in its vein, and where.
 
     Args:
-        seed, voxel_size, progress: as for `upper_arm`.
+        seed, voxel_size, progress: as for `make_upper_arm`.
 
     Raises:
-        VolumeError: as `upper_arm`.
+        VolumeError: as `make_upper_arm`.
     """
-    return upper_arm(seed, voxel_size, progress, thrombus=drawn_thrombus(seed))
+    return make_upper_arm(seed, voxel_size, progress, thrombus=draw_thrombus(seed))
 
 
-def drawn_thrombus(seed: int) -> tuple[float, float]:
+def draw_thrombus(seed: int) -> tuple[float, float]:
     """Draw where a thrombus begins and ends, m along y; in half of the arms there is none.
 
-    >>> drawn_thrombus(1) == drawn_thrombus(1)
+    >>> draw_thrombus(1) == draw_thrombus(1)
     True
     """
     random = np.random.Generator(np.random.PCG64([seed, 2]))
@@ -136,7 +134,7 @@ def drawn_thrombus(seed: int) -> tuple[float, float]:
     return (float(begin), float(begin + length)) if is_there else (0.0, 0.0)
 
 
-def cached_phantom(
+def load_or_make_phantom(
     name: str, seed: int = 1, voxel_size: float = 0.3e-3, progress: Progress | None = None
 ) -> Volume:
     """A phantom from the user's cache folder, made there first if it is not in it yet.
@@ -156,22 +154,22 @@ def cached_phantom(
     """
     make: Callable[[int, float, Progress | None], Volume] = PHANTOMS.load(name)
     key = _key(name, seed, voxel_size)
-    return kept_volume(key, lambda: make(seed, voxel_size, progress))
+    return load_or_make_volume(key, lambda: make(seed, voxel_size, progress))
 
 
-def is_phantom_kept(name: str, seed: int, voxel_size: float) -> bool:
+def is_phantom_cached(name: str, seed: int, voxel_size: float) -> bool:
     """Whether a phantom is in the user's cache folder; it may be damaged."""
     return (cache_folder() / _key(name, seed, voxel_size)).is_dir()
 
 
-def kept_volume(key: str, make: Callable[[], Volume]) -> Volume:
+def load_or_make_volume(key: str, make: Callable[[], Volume]) -> Volume:
     """The labelled volume cached under a key, made first if it is not there.
 
     Args:
         key: a file name that contains everything on which the volume's bytes depend.
         make: makes the volume; called by one process at a time.
     """
-    return kept(key, _pack, _unpack, make)
+    return load_or_create(key, _pack, _unpack, make)
 
 
 def _key(name: str, seed: int, voxel_size: float) -> str:

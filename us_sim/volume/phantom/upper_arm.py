@@ -41,7 +41,7 @@ class PointSpread:
     lateral_range: float = 25e-3  # depth from the focus at which the width is √2 times as large
     elevational_range: float = 20e-3
 
-    def widths(self, depth: float) -> tuple[float, float]:
+    def compute_widths(self, depth: float) -> tuple[float, float]:
         """Lateral and elevational full width at half maximum at a depth, m."""
         away = depth - self.focus
         return (
@@ -49,14 +49,14 @@ class PointSpread:
             self.elevational * math.hypot(1.0, away / self.elevational_range),
         )
 
-    def reach(self, depth: NDArray[np.float64]) -> tuple[float, float, float]:
+    def compute_reach(self, depth: NDArray[np.float64]) -> tuple[float, float, float]:
         """How far (x, y, z) m an echo spreads at any of the depths."""
-        lateral, elevational = np.max([self.widths(float(d)) for d in depth], axis=0)
+        lateral, elevational = np.max([self.compute_widths(float(d)) for d in depth], axis=0)
         scale = _REACH * _SIGMA_PER_WIDTH
         return scale * float(lateral), scale * float(elevational), scale * self.axial
 
 
-def echo_envelope(
+def compute_envelope(
     diffuse: NDArray[np.float32],
     specular: NDArray[np.float32],
     voxel_size: float,
@@ -112,7 +112,8 @@ def _spread(
     correlate1d(echo, axial, axis=2, output=echo, mode="constant")
     for k, at in enumerate(depth):
         lateral, elevational = (
-            _profile(width, voxel_size, random_phase) for width in point_spread.widths(float(at))
+            _profile(width, voxel_size, random_phase)
+            for width in point_spread.compute_widths(float(at))
         )
         plane = correlate1d(echo[:, :, k], lateral, axis=0, mode="constant")
         echo[:, :, k] = correlate1d(plane, elevational, axis=1, mode="constant")
@@ -135,7 +136,7 @@ class Tube:
     swing: tuple[float, float] = (0.0, 0.0)  # m, amplitude along x and z
     phase: float = 0.0  # rad, of the swing at y = 0
 
-    def middle(self, y: float) -> tuple[float, float]:
+    def compute_centre(self, y: float) -> tuple[float, float]:
         """(x, z) m of the centre line at y."""
         angle = 2 * np.pi * y / 70e-3 + self.phase
         return (
@@ -143,14 +144,14 @@ class Tube:
             self.centre[1] + self.swing[1] * float(np.sin(0.7 * angle + 1.0)),
         )
 
-    def distance(
+    def compute_distances(
         self, x: NDArray[np.float64], y: float, z: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Distance (X, Z) m from the wall, negative inside.
 
         The distance is exact on the wall and right to first order beside it.
         """
-        middle_x, middle_z = self.middle(y)
+        middle_x, middle_z = self.compute_centre(y)
         across = (x[:, None] - middle_x) / self.radii[0]
         down = (z[None, :] - middle_z) / self.radii[1]
         # A square root is several times faster than hypot, and nothing here over- or underflows.
@@ -189,16 +190,16 @@ class SmoothNoise:
         counts = np.ceil((block[1] - block[0]) / self._lengths - 1e-9).astype(int) + 3
         self._coefficients = random.standard_normal(counts) / _SPLINE_VARIANCE**1.5
 
-    def plane(
+    def sample_plane(
         self, x: NDArray[np.float64], y: float, z: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """(X, Z) values at the coordinates x (X,), y and z (Z,), in m."""
         here = np.tensordot(self._weights(np.array([y]), 1)[0], self._coefficients, axes=(0, 1))
         return self._weights(x, 0) @ here @ self._weights(z, 2).T
 
-    def line(self, x: NDArray[np.float64], y: float) -> NDArray[np.float64]:
+    def sample_line(self, x: NDArray[np.float64], y: float) -> NDArray[np.float64]:
         """(X,) values along x at y, m, in the lower face of the block."""
-        return self.plane(x, y, self._lower[2:])[:, 0]
+        return self.sample_plane(x, y, self._lower[2:])[:, 0]
 
     def _weights(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
         """(V, coefficients) cubic B-spline weights of positions along an axis."""
@@ -216,7 +217,7 @@ class SmoothNoise:
         return weights
 
 
-def sheets(
+def make_sheets(
     noise: NDArray[np.float64], steps: tuple[float, float], thickness: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Thin sheets of one thickness where a noise is zero: septa of fat, perimysium of muscle.
@@ -270,13 +271,13 @@ class ArmSection:
         """(Z,) m below the skin; 0 above it."""
         return np.maximum(self.z, 0.0)
 
-    def fill(self, label: str, where: NDArray[np.bool_], echo: NDArray[np.float64]) -> None:
+    def fill_tissue(self, label: str, where: NDArray[np.bool_], echo: NDArray[np.float64]) -> None:
         """Put a tissue with its own scatterers where another was."""
         self.labels[where] = (UPPER_ARM_LABELS | THROMBUS)[label]
         self.diffuse[where] = echo[where]
         self.specular[where] = 0.0
 
-    def interface(self, profile: NDArray[np.float64], level: float) -> None:
+    def add_interface(self, profile: NDArray[np.float64], level: float) -> None:
         """Add an echoing surface: a fraction of `_SMOOTH` is specular, the rest speckled."""
         np.maximum(self.specular, _SMOOTH * _echo(level) * profile, out=self.specular)
         np.maximum(self.diffuse, (1 - _SMOOTH) * _echo(level) * profile, out=self.diffuse)
@@ -323,7 +324,7 @@ class UpperArm:
         self._patches = noise(3e-3, 6e-3, 1.6e-3)
         self._cloud = noise(6e-3, 9e-3, 4e-3)
 
-    def section(self, x: NDArray[np.float64], y: float, z: NDArray[np.float64]) -> ArmSection:
+    def cut_section(self, x: NDArray[np.float64], y: float, z: NDArray[np.float64]) -> ArmSection:
         """Labels and echoes at evenly spaced x (X,) and z (Z,), m.
 
         Points beside the block continue its tissue, those above it the skin.
@@ -339,21 +340,23 @@ class UpperArm:
     def _layers(self, section: ArmSection) -> None:
         """Add fat with its septa, and the skin over it."""
         x, y, z = section.x, section.y, section.depth
-        border = 1.8e-3 + 0.08e-3 * self._skin_border.line(x, y)[:, None]
+        border = 1.8e-3 + 0.08e-3 * self._skin_border.sample_line(x, y)[:, None]
         below = z[None, :] - border
-        cloud = self._cloud.plane(x, y, z)
-        section.fill("fat", below >= 0.0, _echo(-37.0 + 1.5 * cloud))
-        profile, facing = sheets(self._lobules.plane(x, y, z), section.steps, 0.15e-3)
-        section.interface(profile * self._patchy(section) * (0.1 + 0.9 * facing), -11.0)
-        section.fill("skin", below < 0.0, _echo(-25.0 - 2800.0 * below + cloud))
-        section.interface(_sheet(z[None, :] - 0.15e-3, 0.15e-3), -5.0)
+        cloud = self._cloud.sample_plane(x, y, z)
+        section.fill_tissue("fat", below >= 0.0, _echo(-37.0 + 1.5 * cloud))
+        profile, facing = make_sheets(self._lobules.sample_plane(x, y, z), section.steps, 0.15e-3)
+        section.add_interface(profile * self._patchy(section) * (0.1 + 0.9 * facing), -11.0)
+        section.fill_tissue("skin", below < 0.0, _echo(-25.0 - 2800.0 * below + cloud))
+        section.add_interface(_sheet(z[None, :] - 0.15e-3, 0.15e-3), -5.0)
 
     def _muscles(self, section: ArmSection) -> None:
         """Add biceps, brachialis and triceps under the fascia, with the septa between them."""
         x, y, z = section.x, section.y, section.depth
-        fascia = 7.0e-3 + 0.6e-3 * self._fascia_shape.line(x, y)[:, None]
+        fascia = 7.0e-3 + 0.6e-3 * self._fascia_shape.sample_line(x, y)[:, None]
         # Septa wave along the arm, and from place to place between the muscles they part.
-        wave = self._septum_shape.line(x, y)[:, None] + 0.8 * self._cloud.plane(x, y, z)
+        wave = self._septum_shape.sample_line(x, y)[:, None] + 0.8 * self._cloud.sample_plane(
+            x, y, z
+        )
         # The medial septum runs from the fascia beside the nerve down to the humerus.
         left_of_septum = 0.9 * (-9e-3 + 0.42 * (z - 15e-3) + 0.5e-3 * wave - x[:, None])
         under_biceps = z - 21e-3 - 0.15 * x[:, None] - 0.8e-3 * wave
@@ -368,37 +371,42 @@ class UpperArm:
         ):
             shifted = z + slope * y
             muscle = where & (z > fascia)
-            cloud = self._cloud.plane(x, y, shifted)
-            section.fill("muscle", muscle, _echo(-41.0 + gain + 1.5 * cloud))
+            cloud = self._cloud.sample_plane(x, y, shifted)
+            section.fill_tissue("muscle", muscle, _echo(-41.0 + gain + 1.5 * cloud))
             for fibres, thickness, level in (
                 (self._fibres, 0.12e-3, -18.0),
                 (self._bundles, 0.17e-3, -13.0),
             ):
-                profile, facing = sheets(fibres.plane(x, y, shifted), section.steps, thickness)
+                profile, facing = make_sheets(
+                    fibres.sample_plane(x, y, shifted), section.steps, thickness
+                )
                 profile *= patchy * (0.1 + 0.9 * facing) * muscle
-                section.interface(profile, level + gain)
-        section.interface(_sheet(z - fascia - 0.7e-3, 0.12e-3) * patchy, -16.0)
-        section.interface(_sheet(left_of_septum, 0.2e-3) * (z > 13e-3) * patchy, -18.0)
-        section.interface(_sheet(under_biceps, 0.2e-3) * ~triceps * (0.4 + 0.6 * patchy), -13.0)
+                section.add_interface(profile, level + gain)
+        section.add_interface(_sheet(z - fascia - 0.7e-3, 0.12e-3) * patchy, -16.0)
+        section.add_interface(_sheet(left_of_septum, 0.2e-3) * (z > 13e-3) * patchy, -18.0)
+        section.add_interface(_sheet(under_biceps, 0.2e-3) * ~triceps * (0.4 + 0.6 * patchy), -13.0)
 
     def _bundle(self, section: ArmSection) -> None:
         """Add artery, vein and nerve in bright connective tissue."""
         x, y, z = section.x, section.y, section.depth
-        walls = [tube.distance(x, y, z) for tube in (self.artery, self.vein, self.nerve)]
+        walls = [tube.compute_distances(x, y, z) for tube in (self.artery, self.vein, self.nerve)]
         near = np.maximum(np.min(walls, axis=0), 0.0)
-        sheath = _echo(-31.0 + 2.0 * self._cloud.plane(x, y, z)) * _sheet(near, 1.0e-3)
+        sheath = _echo(-31.0 + 2.0 * self._cloud.sample_plane(x, y, z)) * _sheet(near, 1.0e-3)
         np.maximum(section.diffuse, sheath, out=section.diffuse)
         for label, distance in zip(("artery", "vein"), walls, strict=False):
-            section.fill(label, distance < 0.0, np.full(distance.shape, _echo(_BLOOD)))
+            section.fill_tissue(label, distance < 0.0, np.full(distance.shape, _echo(_BLOOD)))
         if self._thrombus[0] < y < self._thrombus[1]:
-            clot = _echo(-39.0 + 3.0 * self._cloud.plane(x, y, z))
-            section.fill("vein thrombus", walls[1] < 0.0, clot)
+            clot = _echo(-39.0 + 3.0 * self._cloud.sample_plane(x, y, z))
+            section.fill_tissue("vein thrombus", walls[1] < 0.0, clot)
         self._nerve(section, walls[2])
 
     def _nerve(self, section: ArmSection, distance: NDArray[np.float64]) -> None:
         """Add a nerve: dark fascicles in a bright honeycomb."""
-        section.fill("nerve", distance < 0.0, np.full(distance.shape, _echo(-23.0)))
-        (middle_x, middle_z), (radius_x, radius_z) = self.nerve.middle(section.y), self.nerve.radii
+        section.fill_tissue("nerve", distance < 0.0, np.full(distance.shape, _echo(-23.0)))
+        (middle_x, middle_z), (radius_x, radius_z) = (
+            self.nerve.compute_centre(section.y),
+            self.nerve.radii,
+        )
         for across, down in self._fascicles:
             squares_x = ((section.x - middle_x - across * radius_x) / 0.50e-3) ** 2
             squares_z = ((section.depth - middle_z - down * radius_z) / 0.42e-3) ** 2
@@ -406,13 +414,13 @@ class UpperArm:
 
     def _bone(self, section: ArmSection) -> None:
         x, y, z = section.x, section.y, section.depth
-        distance = self.humerus.distance(x, y, z)
-        distance -= 0.35e-3 * self._cloud.plane(x, y, z)  # no shaft is an ellipse
-        section.fill("bone", distance < 0.0, np.full(distance.shape, _echo(-42.0)))
+        distance = self.humerus.compute_distances(x, y, z)
+        distance -= 0.35e-3 * self._cloud.sample_plane(x, y, z)  # no shaft is an ellipse
+        section.fill_tissue("bone", distance < 0.0, np.full(distance.shape, _echo(-42.0)))
 
     def _patchy(self, section: ArmSection) -> NDArray[np.float64]:
         """(X, Z) from 0 to 1: no sheet of connective tissue echoes everywhere."""
-        noise = self._patches.plane(section.x, section.y, section.depth)
+        noise = self._patches.sample_plane(section.x, section.y, section.depth)
         return np.clip(0.55 + 0.5 * noise, 0.0, 1.0)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from us_sim.errors import UsSimError, VolumeError
 from us_sim.settings.text_files import read_yaml
 from us_sim.volume.reconstruction.settings import ImagePart
-from us_sim.volume.sequences.transforms import frame_matrix, in_metres
+from us_sim.volume.sequences.transforms import parse_frame_matrix, to_metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ def read_calibration(path: Path, probe: str) -> SweepCalibration:
     try:
         rows = read_yaml(path, VolumeError)["image_to_body"]
         text = " ".join(str(float(number)) for row in rows for number in row)
-        matrix = frame_matrix({"image_to_body": text}, "image_to_body")
+        matrix = parse_frame_matrix({"image_to_body": text}, "image_to_body")
     except (LookupError, TypeError, ValueError) as error:
         raise VolumeError(
             f"{path}: holds no image_to_body, a 4 × 4 matrix from pixels to metres on the tracked "
@@ -67,10 +67,10 @@ def _read_plus_configuration(path: Path) -> SweepCalibration:
             continue
         name = f"{start[0].upper()}{start[1:]}To{end[0].upper()}{end[1:]}"
         try:
-            matrix = frame_matrix({name: element.get("Matrix", "")}, name)
+            matrix = parse_frame_matrix({name: element.get("Matrix", "")}, name)
         except ValueError as reason:
             raise VolumeError(f"{path}: the transform {name} is {reason}; correct it") from reason
-        transforms[name] = in_metres(name, matrix)
+        transforms[name] = to_metres(name, matrix)
     if not transforms:
         raise VolumeError(
             f"{path}: holds no <Transform From=... To=... Matrix=...>; give a configuration of "

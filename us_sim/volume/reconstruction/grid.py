@@ -26,7 +26,7 @@ class Grid:
         return float(np.linalg.norm(self.index_to_reference[:3, 0]))
 
 
-def grid_around(points: NDArray[np.float64], spacing: float) -> Grid:
+def fit_grid(points: NDArray[np.float64], spacing: float) -> Grid:
     """Return the grid whose first and last voxels hold the outermost points.
 
     Args:
@@ -60,14 +60,14 @@ def grid_around(points: NDArray[np.float64], spacing: float) -> Grid:
     return Grid(matrix, (i, j, k))
 
 
-def proposed_spacing(points: NDArray[np.float64], pixel: float) -> float:
+def propose_spacing(points: NDArray[np.float64], pixel: float) -> float:
     """Return m: a pixel's size, or as much more as 134 million voxels around the points need."""
     size = np.maximum(np.ptp(points, axis=0), pixel)
     needed = (math.prod(size) / (1 << 27)) ** (1 / 3)
     return pixel if needed <= pixel else math.ceil(1e5 * needed * 1.01) / 1e5
 
 
-def image_mask(part: ImagePart, columns: int, rows: int) -> NDArray[np.bool_]:
+def make_image_mask(part: ImagePart, columns: int, rows: int) -> NDArray[np.bool_]:
     """(rows, columns) whether a pixel is used.
 
     A rectangle holds the pixels whose centres lie in it or on its border. A fan holds those that
@@ -96,7 +96,7 @@ def image_mask(part: ImagePart, columns: int, rows: int) -> NDArray[np.bool_]:
     return used
 
 
-def outline(part: ImagePart, used: NDArray[np.bool_]) -> NDArray[np.float64]:
+def find_outline(part: ImagePart, used: NDArray[np.bool_]) -> NDArray[np.float64]:
     """(N, 4) column, row, 0, 1 of points around the used pixels (rows, columns).
 
     The corners of the rectangle where there is one, as Plus has them, else the first and last

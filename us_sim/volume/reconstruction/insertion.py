@@ -41,7 +41,7 @@ def insert_pixels(pixels, points, to_index, total, count):
             count[i, j, k] += 1
 
 
-def mean_values(
+def compute_means(
     total: NDArray[np.uint32], count: NDArray[np.uint32]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Return the mean of each voxel's pixels, 0 without any, and where there are some."""

@@ -13,14 +13,14 @@ from us_sim.errors import VolumeError
 from us_sim.volume.files.stored_image import check_memory
 from us_sim.volume.reconstruction.grid import (
     Grid,
-    grid_around,
-    image_mask,
-    outline,
-    proposed_spacing,
+    find_outline,
+    fit_grid,
+    make_image_mask,
+    propose_spacing,
 )
-from us_sim.volume.reconstruction.insertion import fill_holes, insert_pixels, mean_values
+from us_sim.volume.reconstruction.insertion import compute_means, fill_holes, insert_pixels
 from us_sim.volume.reconstruction.settings import Compounding, ImagePart
-from us_sim.volume.sequences.sweep import Sweep
+from us_sim.volume.sequences.sweep import TrackedSweep
 from us_sim.volume.volume import Volume
 
 Progress = Callable[[float, str], None]  # is told the fraction done, and the work in progress
@@ -34,10 +34,10 @@ _FILLING = 0.9  # fraction done when holes are filled
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class InsertionPlan:
     """The images of a sweep and the grid that they are inserted into."""
 
-    sweep: Sweep
+    sweep: TrackedSweep
     grid: Grid
     used: NDArray[np.bool_]  # (rows, columns), the pixels that are inserted
     compounding: Compounding
@@ -53,12 +53,12 @@ class Reconstruction:
     filled: int  # voxels
 
 
-def plan(
-    sweep: Sweep,
+def plan_insertion(
+    sweep: TrackedSweep,
     compounding: Compounding,
     part: ImagePart | None = None,
     rest: Rest | None = None,
-) -> Plan:
+) -> InsertionPlan:
     """Find the grid around a sweep's images, and which of their pixels are used.
 
     Args:
@@ -78,19 +78,19 @@ def plan(
             f"those of an image: name its frame by --image, or give the probe's --calibration"
         )
     part = part or ImagePart()
-    used = image_mask(part, sweep.columns, sweep.rows)
-    points = np.einsum("kij,nj->kni", sweep.image_to_reference, outline(part, used))[..., :3]
+    used = make_image_mask(part, sweep.columns, sweep.rows)
+    points = np.einsum("kij,nj->kni", sweep.image_to_reference, find_outline(part, used))[..., :3]
     if rest is not None:
         points = np.stack([rest(k, frame) for k, frame in enumerate(points)])
     points = points.reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         raise VolumeError(f"{sweep.path}: no pixel of its images lies in the tissue of the scene")
-    spacing = compounding.spacing or proposed_spacing(points, pixel)
-    return Plan(sweep, grid_around(points, spacing), used, compounding, rest)
+    spacing = compounding.spacing or propose_spacing(points, pixel)
+    return InsertionPlan(sweep, fit_grid(points, spacing), used, compounding, rest)
 
 
-def reconstruct(planned: Plan, progress: Progress | None = None) -> Reconstruction:
+def reconstruct(planned: InsertionPlan, progress: Progress | None = None) -> Reconstruction:
     """Make the volume of a sweep's images.
 
     Args:
@@ -111,7 +111,7 @@ def reconstruct(planned: Plan, progress: Progress | None = None) -> Reconstructi
     rows, columns = np.nonzero(planned.used)
     pixels = np.column_stack([columns, rows, np.zeros(len(rows))])
     to_index = np.linalg.inv(planned.grid.index_to_reference)
-    placed = zip(sweep.images(), sweep.image_to_reference, strict=True)
+    placed = zip(sweep.read_images(), sweep.image_to_reference, strict=True)
     for k, (image, matrix) in enumerate(placed):
         tell(_FILLING * k / frames, "inserting images")
         points, to_grid = pixels, to_index @ matrix
@@ -119,7 +119,7 @@ def reconstruct(planned: Plan, progress: Progress | None = None) -> Reconstructi
             points = planned.rest(k, pixels @ matrix[:3, :3].T + matrix[:3, 3])
             to_grid = to_index
         insert_pixels(image[planned.used], points, to_grid[:3], total, count)
-    grey, covered = mean_values(total, count)
+    grey, covered = compute_means(total, count)
     del total, count
     if not covered.any():
         raise VolumeError(f"{sweep.path}: no pixel of its images lies in the grid")

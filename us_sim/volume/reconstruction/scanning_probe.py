@@ -21,10 +21,10 @@ from scipy.stats import theilslopes
 from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Placement
 from us_sim.geometry.transducer import ProbeSettings
-from us_sim.settings.choice import Chosen
+from us_sim.settings.choice import ChosenOption
 from us_sim.settings.registry import PROBES
 from us_sim.volume.reconstruction.settings import ImagePart
-from us_sim.volume.sequences.sweep import Sweep
+from us_sim.volume.sequences.sweep import TrackedSweep
 
 _LEAST_POINTS = 16  # of an edge
 _NARROW = math.radians(4.0)  # opening angle below which it is no fan
@@ -40,7 +40,7 @@ class Fan:
     radius: tuple[float, float]  # where beams begin and end
     angles: tuple[float, float]  # of the first and last beam, from +z towards +x
 
-    def holds(self, x: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def contains(self, x: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell whether points are in it."""
         across, down = x - self.apex[0], z - self.apex[1]
         radius, angle = np.hypot(across, down), np.arctan2(across, down)
@@ -55,7 +55,7 @@ class Rectangle:
     x: tuple[float, float]
     z: tuple[float, float]
 
-    def holds(self, x: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def contains(self, x: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell whether points are in it."""
         held = (x >= self.x[0]) & (x <= self.x[1]) & (z >= self.z[0]) & (z <= self.z[1])
         return np.asarray(held)
@@ -69,7 +69,9 @@ class ScanningProbe:
     poses: tuple[Placement, ...]  # in the sweep's reference frame, evenly along its path
 
 
-def scanning_probe(sweep: Sweep, part: ImagePart, used: NDArray[np.bool_]) -> ScanningProbe:
+def find_scanning_probe(
+    sweep: TrackedSweep, part: ImagePart, used: NDArray[np.bool_]
+) -> ScanningProbe:
     """Find the probe of a sweep, and where its face was.
 
     It is the fan that the part names, or the shape that fits the images, or a linear array as wide
@@ -88,15 +90,15 @@ def scanning_probe(sweep: Sweep, part: ImagePart, used: NDArray[np.bool_]) -> Sc
     shape: Fan | Rectangle | None = _named_fan(part, used, pixel)
     if shape is None:
         picked = _spread(sweep, 32)
-        often = np.sum([image > 0 for image in sweep.images(picked.tolist())], axis=0)
+        often = np.sum([image > 0 for image in sweep.read_images(picked.tolist())], axis=0)
         # Lossy compression spills grey levels beyond the border, other ones in every frame.
-        shape = fitted_part(often >= 0.7 * len(picked), pixel, used)
+        shape = fit_part(often >= 0.7 * len(picked), pixel, used)
     is_known = shape is not None or part.clip is not None
     shape = shape or _rectangle(used, pixel)
     return ScanningProbe(_probe(shape) if is_known else None, _poses(sweep, shape, pixel))
 
 
-def fitted_part(
+def fit_part(
     seen: NDArray[np.bool_], pixel: NDArray[np.float64], used: NDArray[np.bool_] | None = None
 ) -> Fan | Rectangle | None:
     """Fit the fan or the rectangle that was scanned; None where neither fits.
@@ -115,7 +117,7 @@ def fitted_part(
     least = _ALIKE
     for part in (_rectangle(body, pixel), _fan(body, within, pixel)):
         if part is not None:
-            inside = part.holds(x, z) & within
+            inside = part.contains(x, z) & within
             overlap = float((inside & body).sum() / max(1, (inside | body).sum()))
             if overlap > least:
                 best, least = part, overlap
@@ -130,7 +132,7 @@ def _named_fan(part: ImagePart, used: NDArray[np.bool_], pixel: NDArray[np.float
     rows, columns = np.nonzero(used)
     farthest = np.hypot(columns - part.fan_origin[0], rows - part.fan_origin[1]).max()
     begins, ends = part.fan_radius
-    if ends > farthest + 2.0:  # pixels; `image_mask` leaves out the border
+    if ends > farthest + 2.0:  # pixels; `make_image_mask` leaves out the border
         ends = float(farthest)
     x, z = (float(place) for place in np.array(part.fan_origin) * pixel)
     side = float(pixel.mean())
@@ -220,9 +222,9 @@ def _probe(shape: Fan | Rectangle) -> ProbeSettings | None:
         kind = "sector" if is_point else "convex"
         values |= {"aperture": 0.02} if is_point else {"radius": shape.radius[0]}
     values["depth"] = _middle_beam(shape)[2]
-    made: Any = PROBES.settings(kind)
+    made: Any = PROBES.load_settings(kind)
     try:
-        array = Chosen(kind, made(**{key: round(value, 5) for key, value in values.items()}))
+        array = ChosenOption(kind, made(**{key: round(value, 5) for key, value in values.items()}))
     except UsSimError:  # out of the range of probes
         return None
     return ProbeSettings(array=array, image=512)
@@ -242,7 +244,7 @@ def _middle_beam(
 
 
 def _poses(
-    sweep: Sweep, shape: Fan | Rectangle, pixel: NDArray[np.float64]
+    sweep: TrackedSweep, shape: Fan | Rectangle, pixel: NDArray[np.float64]
 ) -> tuple[Placement, ...]:
     """Return poses of the middle of the probe's face at frames all over a sweep."""
     face, ahead, _ = _middle_beam(shape)
@@ -260,7 +262,7 @@ def _poses(
     return tuple(poses)
 
 
-def _spread(sweep: Sweep, most: int) -> NDArray[np.int64]:
+def _spread(sweep: TrackedSweep, most: int) -> NDArray[np.int64]:
     """Return indices of so many frames, evenly over a sweep; of all where there are fewer."""
     count = len(sweep.numbers)
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))

@@ -57,10 +57,10 @@ class ImagePart(Settings):
         fan["fan_angles"] = self.fan_angles
         missing = [name for name, value in fan.items() if value is None]
         if 0 < len(missing) < len(fan):
-            raise self.refused(missing[0], "is missing; a fan has origin, radius and angles")
+            raise self.make_error(missing[0], "is missing; a fan has origin, radius and angles")
         for name in ("fan_radius", "fan_angles"):
             pair = getattr(self, name)
             if pair is not None and not pair[0] < pair[1]:
-                raise self.refused(name, f"{pair[0]:g} must be less than {pair[1]:g}")
+                raise self.make_error(name, f"{pair[0]:g} must be less than {pair[1]:g}")
         if self.clip is not None and min(self.clip[2:]) <= 0.0:
-            raise self.refused("clip", "must have columns and rows above zero")
+            raise self.make_error("clip", "must have columns and rows above zero")

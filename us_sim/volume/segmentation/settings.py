@@ -9,7 +9,7 @@ from pathlib import Path
 
 from us_sim.errors import VolumeError
 from us_sim.settings.quantity import Quantity
-from us_sim.settings.reading import Reader
+from us_sim.settings.reading import SettingsReader
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.text_files import read_yaml
 from us_sim.volume.cases.settings import check_name
@@ -54,9 +54,11 @@ class StructureSeeds(Settings):
     def check(self) -> None:
         """Refuse no seeds, and a range that holds nothing."""
         if not self.seeds_mm:
-            raise self.refused("seeds_mm", "is empty; give a point in it")
+            raise self.make_error("seeds_mm", "is empty; give a point in it")
         if self.lower > self.upper:
-            raise self.refused("upper", f"{self.upper:g} is below lower, {self.lower:g}: swap them")
+            raise self.make_error(
+                "upper", f"{self.upper:g} is below lower, {self.lower:g}: swap them"
+            )
 
 
 @dataclass(frozen=True)
@@ -73,10 +75,10 @@ class SegmentationSettings(Settings):
     def check(self) -> None:
         """Refuse no structures, too many, and names that are none."""
         if not 1 <= len(self.structures) <= _MOST:
-            raise self.refused("structures", f"are {len(self.structures)}; give 1 to {_MOST}")
+            raise self.make_error("structures", f"are {len(self.structures)}; give 1 to {_MOST}")
         for name in self.structures:
             if problem := check_name(name):
-                raise self.refused("structures", problem)
+                raise self.make_error("structures", problem)
 
 
 def read_seeds(path: Path) -> SegmentationSettings:
@@ -86,7 +88,7 @@ def read_seeds(path: Path) -> SegmentationSettings:
         VolumeError: it cannot be read, or a key or value will not do.
     """
     document = read_yaml(path, VolumeError)
-    return Reader(str(path), None, VolumeError).read(SegmentationSettings, document)
+    return SettingsReader(str(path), None, VolumeError).read(SegmentationSettings, document)
 
 
 @dataclass(frozen=True)
@@ -115,9 +117,9 @@ class SegmentRequest(Settings):
     def check(self) -> None:
         """Refuse two sources, names without a file of labels, and names that are none."""
         if self.labels is not None and self.seeds is not None:
-            raise self.refused("seeds", "and --labels are two sources of labels: keep one")
+            raise self.make_error("seeds", "and --labels are two sources of labels: keep one")
         if self.names and self.labels is None:
-            raise self.refused("names", "is for --labels only")
+            raise self.make_error("names", "is for --labels only")
         self.given_names()
 
     def given_names(self) -> dict[int, str]:
@@ -130,10 +132,10 @@ class SegmentRequest(Settings):
         for text in self.names:
             match = re.fullmatch(r"(\d{1,3})=(.+)", text)
             if match is None or int(match[1]) not in range(1, 256):
-                raise self.refused("names", f"{text!r}: write LABEL=NAME, e.g. 3=gallbladder")
+                raise self.make_error("names", f"{text!r}: write LABEL=NAME, e.g. 3=gallbladder")
             if problem := check_name(match[2]):
-                raise self.refused("names", problem)
+                raise self.make_error("names", problem)
             if int(match[1]) in names or match[2] in names.values():
-                raise self.refused("names", f"{text!r}: label or name is given twice")
+                raise self.make_error("names", f"{text!r}: label or name is given twice")
             names[int(match[1])] = match[2]
         return names

@@ -16,7 +16,7 @@ from us_sim.volume.volume import LabelMap, Volume
 Progress = Callable[[float, str], None]
 
 
-def segment(
+def segment_volume(
     volume: Volume, settings: SegmentationSettings, progress: Progress = lambda *_: None
 ) -> LabelMap:
     """Find the labels of structures, numbered in the order in which the settings name them.

@@ -25,15 +25,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.metaimage import metaimage_numbers
-from us_sim.volume.files.nrrd import nrrd_numbers
-from us_sim.volume.files.readers import is_sequence, sequence_header
+from us_sim.volume.files.metaimage import describe_metaimage_numbers
+from us_sim.volume.files.nrrd import describe_nrrd_numbers
+from us_sim.volume.files.readers import is_sequence, read_sequence_header
 from us_sim.volume.files.stored_image import GreyLevels, StoredNumbers
 from us_sim.volume.sequences.transforms import (
     FrameTransforms,
-    frame_fields,
-    frame_time,
+    parse_frame_time,
     read_transforms,
+    split_frame_fields,
 )
 
 SEQUENCE_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nhdr")
@@ -66,7 +66,7 @@ class TrackedSequence:
             raise self.stored
         return self.stored
 
-    def images(self, which: Iterable[int] | None = None) -> Iterator[NDArray[np.uint8]]:
+    def read_images(self, which: Iterable[int] | None = None) -> Iterator[NDArray[np.uint8]]:
         """Yield images (rows, columns) in grey, turned to ``MF``; those at indices in `numbers`.
 
         Other numbers than bytes are spread over all frames.
@@ -78,7 +78,7 @@ class TrackedSequence:
             image = self._levels(self._images[..., number].T)
             if self.are_colours:
                 image = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-            yield np.ascontiguousarray(turned(image, self.orientation))
+            yield np.ascontiguousarray(turn_image(image, self.orientation))
 
     @cached_property
     def _images(self) -> NDArray[Any]:
@@ -90,7 +90,7 @@ class TrackedSequence:
         if self._images.dtype == np.uint8:
             return GreyLevels()
         frames = (self._images[..., n].T for n in range(self.count))
-        return GreyLevels.over(self.path, (each.reshape(len(each), -1) for each in frames))
+        return GreyLevels.find_levels(self.path, (each.reshape(len(each), -1) for each in frames))
 
 
 def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
@@ -106,8 +106,8 @@ def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
     path = Path(path)
     if not path.is_file():
         raise VolumeError(f"{path}: there is no such file; {_GIVE}")
-    keys, kinds, sizes, start = sequence_header(path)
-    described = frame_fields(keys)
+    keys, kinds, sizes, start = read_sequence_header(path)
+    described = split_frame_fields(keys)
     if not described or (kinds and not is_sequence(kinds, keys)):
         axes = f" (its axes are {' '.join(kinds)})" if kinds else ""
         raise VolumeError(f"{path}: is a volume{axes}, as it holds no tracked frames; {_GIVE}")
@@ -142,7 +142,7 @@ def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
         rows,
         count,
         np.array(numbers, dtype=np.int64),
-        np.array([frame_time(fields) for fields in frames]),
+        np.array([parse_frame_time(fields) for fields in frames]),
         np.array([fields.get("ImageStatus", "OK").upper() == "OK" for fields in frames]),
         read_transforms(frames),
         channels > 1,
@@ -167,15 +167,17 @@ def _stored_images(
         problem = f"its images are {kind}, no B-mode: give the logarithm of their envelopes"
     else:
         is_nrrd = path.name.lower().endswith((".nrrd", ".nhdr"))
-        numbers = (nrrd_numbers if is_nrrd else metaimage_numbers)(path, keys, start)
+        numbers = (describe_nrrd_numbers if is_nrrd else describe_metaimage_numbers)(
+            path, keys, start
+        )
         return replace(numbers, size=(channels, columns, rows, count)[channels == 1 :])
     raise VolumeError(f"{path}: {problem}")
 
 
-def turned(image: NDArray[np.uint8], code: str) -> NDArray[np.uint8]:
+def turn_image(image: NDArray[np.uint8], code: str) -> NDArray[np.uint8]:
     """Turn an image (rows, columns) that was stored in an orientation, as it is in ``MF``.
 
-    >>> turned(np.array([[1, 2], [3, 4], [5, 6]]), "FM")
+    >>> turn_image(np.array([[1, 2], [3, 4], [5, 6]]), "FM")
     array([[1, 3, 5],
            [2, 4, 6]])
     """

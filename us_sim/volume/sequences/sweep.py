@@ -16,13 +16,13 @@ from us_sim.volume.sequences.sequence import TrackedSequence, read_sequence
 from us_sim.volume.sequences.transforms import (
     FrameTransforms,
     TransformChain,
-    along,
-    shortest_chain,
+    find_shortest_chain,
+    multiply_chain,
 )
 
 
 @dataclass(frozen=True, eq=False)
-class Sweep:
+class TrackedSweep:
     """Images of a moving probe with the pose of each; the images stay in the file."""
 
     path: Path
@@ -36,10 +36,10 @@ class Sweep:
     chain: TransformChain  # of which the poses were made
     sequence: TrackedSequence
 
-    def images(self, which: Iterable[int] | None = None) -> Iterator[NDArray[np.uint8]]:
+    def read_images(self, which: Iterable[int] | None = None) -> Iterator[NDArray[np.uint8]]:
         """Yield images (rows, columns): all, or those at these indices into `numbers`."""
         numbers = self.numbers if which is None else self.numbers[list(which)]
-        return self.sequence.images(np.searchsorted(self.sequence.numbers, numbers).tolist())
+        return self.sequence.read_images(np.searchsorted(self.sequence.numbers, numbers).tolist())
 
 
 def read_sweep(
@@ -48,7 +48,7 @@ def read_sweep(
     image: str = "Image",
     reference: str = "Reference",
     calibration: Mapping[str, NDArray[np.float64]] | None = None,
-) -> Sweep:
+) -> TrackedSweep:
     """Read a sequence file, and place each of its images by a chain of transforms.
 
     Frames whose transform or time stamp is missing, not finite or singular, or whose status is
@@ -76,14 +76,14 @@ def read_sweep(
         )
     for name, matrix in (calibration or {}).items():
         known[name] = FrameTransforms(np.broadcast_to(matrix, (count, 4, 4)), ("",) * count)
-    chain = shortest_chain(known, image, reference)
+    chain = find_shortest_chain(known, image, reference)
     if chain is None:
         raise VolumeError(
             f"{sequence.path}: no transform leads from {image} to {reference}; the known ones are "
             f"{', '.join(sorted(known))}: name others, or give the probe's calibration (such as "
             f"ImageToProbe)"
         )
-    placed = along(known, chain)
+    placed = multiply_chain(known, chain)
     faults = list(placed.faults)
     for k in np.flatnonzero(np.isnan(sequence.times)):
         faults[k] = faults[k] or "no Timestamp"
@@ -99,7 +99,7 @@ def read_sweep(
             f"{sequence.path}: none of its {sequence.count} frames can be used ({why}); record the "
             f"sweep again with the probe in the tracker's view"
         )
-    return Sweep(
+    return TrackedSweep(
         sequence.path,
         sequence.columns,
         sequence.rows,

@@ -47,7 +47,7 @@ class TransformChain:
     steps: tuple[tuple[str, bool], ...]
 
 
-def shortest_chain(names: Iterable[str], start: str, goal: str) -> TransformChain | None:
+def find_shortest_chain(names: Iterable[str], start: str, goal: str) -> TransformChain | None:
     """The chain of the fewest transforms from one frame to another; None where there is none."""
     steps: dict[str, list[tuple[str, str, bool]]] = {}  # from a frame: where to, by what, forwards
     for name in names:
@@ -78,7 +78,7 @@ class FrameTransforms:
         return np.array([not fault for fault in self.faults], dtype=bool)
 
 
-def frame_fields(header: Mapping[str, str]) -> dict[int, dict[str, str]]:
+def split_frame_fields(header: Mapping[str, str]) -> dict[int, dict[str, str]]:
     """The fields of each frame by its number, their names without ``Seq_Frame0000_``."""
     frames: dict[int, dict[str, str]] = {}
     for key, value in header.items():
@@ -87,7 +87,7 @@ def frame_fields(header: Mapping[str, str]) -> dict[int, dict[str, str]]:
     return frames
 
 
-def frame_matrix(fields: Mapping[str, str], key: str) -> NDArray[np.float64]:
+def parse_frame_matrix(fields: Mapping[str, str], key: str) -> NDArray[np.float64]:
     """A frame's transform (4, 4) as the format holds it: to millimetres, and maybe scaled.
 
     Raises:
@@ -111,7 +111,7 @@ def frame_matrix(fields: Mapping[str, str], key: str) -> NDArray[np.float64]:
     return matrix
 
 
-def frame_time(fields: Mapping[str, str]) -> float:
+def parse_frame_time(fields: Mapping[str, str]) -> float:
     """When the frame was recorded, s of the recorder's clock; nan where it does not say it."""
     try:
         time = float(fields["Timestamp"])
@@ -132,7 +132,7 @@ def _over_frames(frames: Sequence[Mapping[str, str]], name: str) -> FrameTransfo
     faults = [""] * len(frames)
     for k, fields in enumerate(frames):
         try:
-            matrices[k] = frame_matrix(fields, f"{name}Transform")
+            matrices[k] = parse_frame_matrix(fields, f"{name}Transform")
         except ValueError as reason:
             faults[k] = str(reason)
     identity = (matrices == np.eye(4)).all(axis=(1, 2))
@@ -141,10 +141,10 @@ def _over_frames(frames: Sequence[Mapping[str, str]], name: str) -> FrameTransfo
         matrices[identity] = np.nan
         for k in np.flatnonzero(identity).tolist():
             faults[k] = "an identity among poses that are none"
-    return FrameTransforms(in_metres(name, matrices), tuple(faults))
+    return FrameTransforms(to_metres(name, matrices), tuple(faults))
 
 
-def in_metres(name: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def to_metres(name: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """A transform of that name, or (K, 4, 4) of them, from millimetres to metres.
 
     Coordinates of images stay pixels.
@@ -158,7 +158,9 @@ def in_metres(name: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     return matrix
 
 
-def along(transforms: Mapping[str, FrameTransforms], chain: TransformChain) -> FrameTransforms:
+def multiply_chain(
+    transforms: Mapping[str, FrameTransforms], chain: TransformChain
+) -> FrameTransforms:
     """The product of a chain's transforms, valid where all of them are."""
     first = transforms[chain.steps[0][0]]
     matrices, faults = np.broadcast_to(np.eye(4), first.matrices.shape), [""] * len(first.faults)

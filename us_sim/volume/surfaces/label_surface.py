@@ -1,13 +1,13 @@
 """Surfaces around labelled structures of a volume, by marching cubes, and their STL files.
 
 >>> import numpy as np
->>> from us_sim.volume.surfaces.label_surface import label_surface
+>>> from us_sim.volume.surfaces.label_surface import make_label_surface
 >>> from us_sim.volume.volume import Volume
 >>> labels = np.zeros((40, 40, 40), np.uint8)
 >>> labels[10:30, 10:30, 10:30] = 6
 >>> placed = np.diag([1e-3, 1e-3, 1e-3, 1.0])
 >>> volume = Volume(np.zeros_like(labels), placed, labels=labels, label_names={6: "vein"})
->>> vertices, triangles = label_surface(volume, 6)
+>>> vertices, triangles = make_label_surface(volume, 6)
 >>> vertices.min(axis=0).round(4), vertices.max(axis=0).round(4)  # m, half a voxel beyond centres
 (array([0.0095, 0.0095, 0.0095]), array([0.0295, 0.0295, 0.0295]))
 """
@@ -35,7 +35,7 @@ _STAIRS_LEVEL = 0.49
 and some edges of the surface would have four triangles. Now they are always joined."""
 
 
-def label_surface(
+def make_label_surface(
     volume: Volume, label: int, spacing: float = 0.0, within: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Make the closed surface around all voxels of a label, smoothed to hide their stairs.
@@ -75,7 +75,9 @@ def label_surface(
     level = _STAIRS_LEVEL
     if field is not stairs:
         wanted = np.count_nonzero(mask) / steps.prod()
-        one, other = (abs(enclosed_volume(*marching_cubes(field, at)[:2])) for at in _LEVELS)
+        one, other = (
+            abs(compute_enclosed_volume(*marching_cubes(field, at)[:2])) for at in _LEVELS
+        )
         level = _LEVELS[0] + (wanted - one) / (other - one) * (_LEVELS[1] - _LEVELS[0])
         level = float(np.clip(level, 0.2, _LEVELS[0]))
     vertices, triangles = marching_cubes(field, level, gradient_direction="ascent")[:2]
@@ -86,11 +88,11 @@ def label_surface(
     return placed, np.ascontiguousarray(triangles, dtype=np.int32)
 
 
-def enclosed_volume(vertices: NDArray[np.float64], triangles: NDArray[np.integer]) -> float:
+def compute_enclosed_volume(vertices: NDArray[np.float64], triangles: NDArray[np.integer]) -> float:
     """Return m³ inside a closed surface by Gauss's theorem; below 0 where triangles face inwards.
 
     >>> corners = np.array([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 3]])
-    >>> enclosed_volume(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+    >>> compute_enclosed_volume(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
     4.5
     """
     a, b, c = (vertices - vertices.mean(axis=0))[triangles.T]
@@ -122,13 +124,13 @@ def write_stl(path: Path, vertices: NDArray[np.float64], triangles: NDArray[np.i
         partial.write_bytes(header + np.uint32(len(facets)).tobytes() + facets.tobytes())
 
 
-def spacing_for(
+def choose_spacing(
     volume: Volume, labels: list[int], triangles: int, within: NDArray[np.float64] | None = None
 ) -> float:
     """Return m, the spacing at which surfaces of labels have about so many triangles together.
 
     Raises:
-        VolumeError: as `label_surface`.
+        VolumeError: as `make_label_surface`.
     """
     faces = 0.0
     sides = np.linalg.norm(volume.index_to_patient[:3, :3], axis=0)
@@ -140,7 +142,7 @@ def spacing_for(
     return float(np.sqrt(2.0 * faces / max(triangles, 1)))
 
 
-def occurs(volume: Volume, label: int, within: NDArray[np.float64]) -> bool:
+def is_label_within(volume: Volume, label: int, within: NDArray[np.float64]) -> bool:
     """Tell whether a label has a voxel in a box, (2, 3) m in ``patient``."""
     try:
         _voxels_of(volume, label, within)

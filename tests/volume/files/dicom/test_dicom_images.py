@@ -16,13 +16,13 @@ from pydicom.uid import (
 
 from us_sim.errors import VolumeError
 from us_sim.volume.files.dicom.header import open_dicom
-from us_sim.volume.files.dicom.pixels import GreyImages, image_format, stored_frames
+from us_sim.volume.files.dicom.pixels import GreyImages, read_image_format, read_stored_frames
 
 CINE = np.random.default_rng(3).integers(0, 256, (4, 12, 10), dtype=np.uint8)
 
 
 def images(path):
-    return np.array(list(GreyImages([open_dicom(path)]).images()))
+    return np.array(list(GreyImages([open_dicom(path)]).read_images()))
 
 
 def refused(path, message):
@@ -96,7 +96,7 @@ def test_headers_that_do_not_fit_their_images_are_refused(tmp_path, syntax, valu
 
 def test_htj2k_is_decoded_and_jpeg_of_12_bits_refused(shared_file):
     file = open_dicom(shared_file("foreign-files/HTJ2K_08_RGB.dcm"))
-    (stored,) = stored_frames(file, image_format(file), [0])
+    (stored,) = read_stored_frames(file, read_image_format(file), [0])
     np.testing.assert_array_equal(stored[160, 295], (91, 37, 2))  # as pydicom's own tests have it
     refused(shared_file("foreign-files/JPEG-lossy.dcm"), "decoded")
 

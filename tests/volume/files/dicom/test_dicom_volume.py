@@ -11,7 +11,7 @@ from pydicom.data import get_testdata_file
 from pydicom.uid import ImplicitVRLittleEndian, generate_uid
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.dicom.placed_images import opened_images, placed_images
+from us_sim.volume.files.dicom.placed_images import open_images, place_images
 from us_sim.volume.files.readers import read_placement, read_volume
 
 MR_IMAGE = "1.2.840.10008.5.1.4.1.1.4"
@@ -40,10 +40,10 @@ def test_of_several_volumes_each_can_be_had_and_the_echoes_are_taken(tmp_path):
     made = enhanced(VOXELS, PLACED, times=3)
     path = write(tmp_path / "a.dcm", made)
     for time in (1, 2, 3):
-        voxels = placed_images(opened_images([path]), volume=time).voxels()
+        voxels = place_images(open_images([path]), volume=time).read_voxels()
         np.testing.assert_array_equal(voxels, VOXELS + np.uint8(time - 1))
     with pytest.raises(VolumeError, match=r"3 volumes .*4"):
-        placed_images(opened_images([path]), volume=4)
+        place_images(open_images([path]), volume=4)
     for n, group in enumerate(made.PerFrameFunctionalGroupsSequence):
         kind = "TISSUE_INTENSITY" if 5 <= n < 10 else "FLOW_VELOCITY"
         group.ImageDataTypeSequence = [item(DataType=kind)]
@@ -79,9 +79,9 @@ def require_simpleitks(placed, folder):
 
 
 def test_series_of_files_lie_where_simpleitk_says(tmp_path):
-    require_simpleitks(placed_images(opened_images(single_files(tmp_path)[::-1])), tmp_path)
+    require_simpleitks(place_images(open_images(single_files(tmp_path)[::-1])), tmp_path)
     files = real_series("98892001/CT5N")
-    require_simpleitks(placed_images(opened_images(files)), files[0].parent)
+    require_simpleitks(place_images(open_images(files)), files[0].parent)
 
 
 def real_series(name):
@@ -142,7 +142,7 @@ def test_files_of_two_series_and_one_slice_are_refused(tmp_path):
     made.SeriesInstanceUID = generate_uid()
     made.save_as(paths[0])
     with pytest.raises(VolumeError, match="several series"):
-        placed_images(opened_images(paths))
+        place_images(open_images(paths))
 
 
 @pytest.mark.parametrize(
@@ -162,4 +162,4 @@ def test_images_at_one_place_are_a_cine_and_no_volume(tmp_path):
     made = enhanced(VOXELS[:, :, :1], turned(), times=5)
     path = write(tmp_path / "a.dcm", made)
     with pytest.raises(VolumeError, match="5 images at one place"):
-        placed_images(opened_images([path]))
+        place_images(open_images([path]))

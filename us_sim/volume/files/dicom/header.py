@@ -21,7 +21,7 @@ EXPORT = (
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
+def silence_pydicom() -> Iterator[None]:
     """Silence pydicom, whose warnings would show the values that do not keep to the standard."""
     from pydicom import config
 
@@ -35,10 +35,10 @@ def quiet() -> Iterator[None]:
         config.settings.reading_validation_mode = before
 
 
-def values(header: Any, key: str | int) -> list[Any]:
+def read_values(header: Any, key: str | int) -> list[Any]:
     """Return the values of an element; none where it is missing, empty or cannot be converted."""
     try:
-        with quiet():
+        with silence_pydicom():
             found = header[key].value if key in header else None
     except Exception:  # pydicom converts a value when it is first asked for
         return []
@@ -46,35 +46,35 @@ def values(header: Any, key: str | int) -> list[Any]:
     return [each for each in found if each is not None]
 
 
-def text(header: Any, key: str | int) -> str:
+def read_text(header: Any, key: str | int) -> str:
     """Return a text without blanks around it; of several the first; empty where there is none."""
-    found = next(iter(values(header, key)), "")
+    found = next(iter(read_values(header, key)), "")
     return str(found.decode("latin-1") if isinstance(found, bytes) else found).strip(" \0")
 
 
-def numbers(header: Any, key: str | int, count: int | None = None) -> tuple[float, ...]:
+def read_numbers(header: Any, key: str | int, count: int | None = None) -> tuple[float, ...]:
     """Return finite numbers, ``count`` of them where it is given; else none."""
     try:
-        found = tuple(float(each) for each in values(header, key))
+        found = tuple(float(each) for each in read_values(header, key))
     except (TypeError, ValueError):
         return ()
     return found if len(found) == (count or len(found)) and all(map(math.isfinite, found)) else ()
 
 
-def number(header: Any, key: str | int) -> float | None:
+def read_number(header: Any, key: str | int) -> float | None:
     """Return a finite number; of several the first."""
-    return next(iter(numbers(header, key)), None)
+    return next(iter(read_numbers(header, key)), None)
 
 
-def items(header: Any, key: str | int) -> list[Any]:
+def read_items(header: Any, key: str | int) -> list[Any]:
     """Return the items of a sequence; none where there is none."""
-    return [each for each in values(header, key) if not isinstance(each, str | bytes)]
+    return [each for each in read_values(header, key) if not isinstance(each, str | bytes)]
 
 
-def groups_of(header: Any, frames: int) -> list[tuple[Any, ...]]:
+def read_functional_groups(header: Any, frames: int) -> list[tuple[Any, ...]]:
     """Return the functional groups of each image (PS3.3, C.7.6.16): its own, then the shared."""
-    shared = items(header, "SharedFunctionalGroupsSequence")[:1]
-    own = items(header, "PerFrameFunctionalGroupsSequence")
+    shared = read_items(header, "SharedFunctionalGroupsSequence")[:1]
+    own = read_items(header, "PerFrameFunctionalGroupsSequence")
     return [(group, *shared) for group in own] if len(own) == frames else [()] * frames
 
 
@@ -85,7 +85,7 @@ def is_dicom(path: Path) -> bool:
     return start[128:] == b"DICM" or (start[:2] in (b"\x02\0", b"\x08\0") and not any(start[3:4]))
 
 
-def refuse_other(path: Path, advice: str) -> VolumeError:
+def no_image_error(path: Path, advice: str) -> VolumeError:
     """Return the error of a file that is no image; a packed one is called so."""
     with path.open("rb") as file:
         packed = {b"\x1f\x8b": "gzip", b"PK": "zip", b"BZ": "bzip2"}.get(file.read(2))
@@ -94,7 +94,7 @@ def refuse_other(path: Path, advice: str) -> VolumeError:
     )
 
 
-def dicom_files(folder: Path) -> list[Path]:
+def find_dicom_files(folder: Path) -> list[Path]:
     """Return the DICOM files in a folder."""
     found = [path for path in sorted(folder.iterdir()) if path.is_file() and is_dicom(path)]
     found = [path for path in found if path.name.upper() != "DICOMDIR"]
@@ -116,7 +116,7 @@ def open_dicom(path: str | os.PathLike[str]) -> Any:
     if not is_dicom(path):
         raise VolumeError(f"{path}: is no DICOM file: it does not begin as one does")
     try:
-        with quiet():
+        with silence_pydicom():
             header = dcmread(str(path), force=True)
     except Exception as error:  # of many kinds, which may show values
         raise VolumeError(

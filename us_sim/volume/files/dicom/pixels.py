@@ -19,11 +19,11 @@ from us_sim.errors import VolumeError
 from us_sim.volume.files.dicom.header import (
     EXPORT,
     EXTRA,
-    groups_of,
-    items,
-    number,
-    numbers,
-    quiet,
+    read_functional_groups,
+    read_items,
+    read_number,
+    read_numbers,
+    silence_pydicom,
 )
 from us_sim.volume.files.stored_image import GreyLevels, check_claim
 
@@ -45,7 +45,7 @@ class ImageFormat:
     used_bits: int  # of a number that count
 
 
-def image_format(header: Any) -> ImageFormat:
+def read_image_format(header: Any) -> ImageFormat:
     """Read the format that a header states, and compare it with the bytes that there are."""
     from pydicom.pixels.utils import get_expected_length, get_nr_frames
 
@@ -55,7 +55,7 @@ def image_format(header: Any) -> ImageFormat:
     if pixels is None:
         raise VolumeError(f"{path}: holds no image; give another DICOM file, or {EXPORT}")
     try:
-        with quiet():
+        with silence_pydicom():
             form = ImageFormat(
                 int(get_nr_frames(header)),
                 int(header.Rows),
@@ -87,15 +87,17 @@ def image_format(header: Any) -> ImageFormat:
     return form
 
 
-def stored_frames(file: Any, form: ImageFormat, frames: Sequence[int]) -> Iterator[NDArray[Any]]:
+def read_stored_frames(
+    file: Any, form: ImageFormat, frames: Sequence[int]
+) -> Iterator[NDArray[Any]]:
     """Yield images of a file, (rows, columns) or (rows, columns, RGB), by their numbers."""
     from pydicom.pixels import iter_pixels
 
     try:
-        with quiet():
+        with silence_pydicom():
             found = iter_pixels(file, indices=list(frames))
         for _ in frames:
-            with quiet():
+            with silence_pydicom():
                 image = next(found)
             if image.shape[:2] != (form.rows, form.columns):
                 raise ValueError(f"an image has {image.shape[:2]} pixels")
@@ -112,8 +114,8 @@ def _grey_palette(file: Any) -> tuple[int, NDArray[np.uint8]]:
     from pydicom.pixels import apply_color_lut
 
     try:
-        count, first, _ = map(int, numbers(file, "RedPaletteColorLookupTableDescriptor", 3))
-        with quiet():
+        count, first, _ = map(int, read_numbers(file, "RedPaletteColorLookupTableDescriptor", 3))
+        with silence_pydicom():
             every = np.arange(first, first + (count or 1 << 16))
             colours = apply_color_lut(every, file)[..., :3]
     except Exception as error:
@@ -131,7 +133,7 @@ class GreyImages:
     def __init__(self, files: Sequence[Any]) -> None:
         self.files = list(files)
         self.path: str = self.files[0].filename  # which errors name
-        self.formats = [image_format(file) for file in self.files]
+        self.formats = [read_image_format(file) for file in self.files]
         self.form = self.formats[0]
         for file, form in zip(self.files, self.formats, strict=True):
             if replace(form, frames=self.form.frames) != self.form:
@@ -158,7 +160,7 @@ class GreyImages:
         }
         return tuple(sentence for sentence, is_so in said.items() if is_so)
 
-    def images(
+    def read_images(
         self, which: Sequence[tuple[int, int]] | None = None, keep: NDArray[np.bool_] | None = None
     ) -> Iterator[NDArray[np.uint8]]:
         """Yield images (rows, columns), in the order in which they are asked for.
@@ -171,7 +173,7 @@ class GreyImages:
         levels = GreyLevels()
         if not self._plain:
             kept = (each if keep is None else each[keep] for each in self._brightness(which))
-            levels = GreyLevels.over(self.path, kept)
+            levels = GreyLevels.find_levels(self.path, kept)
         for image in self._brightness(which):
             grey = levels(image)
             if self._inverted:
@@ -193,8 +195,10 @@ class GreyImages:
         key = "PixelValueTransformationSequence"
         return [
             [
-                _slope_and_offset(*(each for group in groups for each in items(group, key)), header)
-                for groups in groups_of(header, form.frames)
+                _slope_and_offset(
+                    *(each for group in groups for each in read_items(group, key)), header
+                )
+                for groups in read_functional_groups(header, form.frames)
             ]
             for header, form in zip(self.files, self.formats, strict=True)
         ]
@@ -204,7 +208,7 @@ class GreyImages:
         palette = _grey_palette(self.files[0]) if self._is_palette else None
         for n, run in groupby(which, key=lambda each: each[0]):
             wanted = [k for _, k in run]
-            stored = stored_frames(self.files[n], self.formats[n], wanted)
+            stored = read_stored_frames(self.files[n], self.formats[n], wanted)
             for k, image in zip(wanted, stored, strict=True):
                 if palette is not None:
                     first, greys = palette
@@ -226,4 +230,6 @@ def _luma(image: NDArray[Any]) -> NDArray[Any]:
 def _slope_and_offset(*places: Any) -> tuple[float, float]:
     """Read the first of some places that has them; 1 and 0 where none has."""
     header = next((place for place in places if "RescaleSlope" in place), places[-1])
-    return number(header, "RescaleSlope") or 1.0, number(header, "RescaleIntercept") or 0.0
+    return read_number(header, "RescaleSlope") or 1.0, read_number(
+        header, "RescaleIntercept"
+    ) or 0.0

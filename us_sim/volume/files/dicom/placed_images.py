@@ -19,17 +19,17 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.volume.files.dicom.header import (
     EXPORT,
-    groups_of,
-    items,
-    number,
-    numbers,
     open_dicom,
-    text,
-    values,
+    read_functional_groups,
+    read_items,
+    read_number,
+    read_numbers,
+    read_text,
+    read_values,
 )
 from us_sim.volume.files.dicom.pixels import GreyImages
-from us_sim.volume.files.placement import checked_placement
-from us_sim.volume.files.stored_image import volume_of_slices
+from us_sim.volume.files.placement import make_placement
+from us_sim.volume.files.stored_image import stack_slices
 
 SEGMENTATIONS = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
 """Classes of files that hold labels: masks of segments, and label maps."""
@@ -60,16 +60,16 @@ class PlacedImages:
     placement: NDArray[np.float64]  # (4, 4) m, from (column, row, image)
     volumes: int  # how many there are in time
 
-    def voxels(self) -> NDArray[np.uint8]:
+    def read_voxels(self) -> NDArray[np.uint8]:
         """Read the grey values (i, j, k), a few images at a time."""
-        return volume_of_slices(self.images.images(self.which), len(self.which))
+        return stack_slices(self.images.read_images(self.which), len(self.which))
 
 
-def opened_images(paths: Sequence[str | os.PathLike[str]]) -> GreyImages:
+def open_images(paths: Sequence[str | os.PathLike[str]]) -> GreyImages:
     """Open the images of one or several DICOM files."""
     files = [open_dicom(path) for path in paths]
     for file in files:
-        if text(file, "SOPClassUID") in SEGMENTATIONS:
+        if read_text(file, "SOPClassUID") in SEGMENTATIONS:
             raise VolumeError(
                 f"{file.filename}: is a segmentation, which has labels and no grey values; save it "
                 f"as .seg.nrrd in 3D Slicer, and give that to `us-sim segment CASE --labels`"
@@ -77,7 +77,7 @@ def opened_images(paths: Sequence[str | os.PathLike[str]]) -> GreyImages:
     return GreyImages(files)
 
 
-def placed_images(
+def place_images(
     images: GreyImages, volume: int = 1, spacing: Sequence[float] = ()
 ) -> PlacedImages:
     """Place the volume that DICOM files hold: an enhanced or multi-frame one, or an image each.
@@ -94,7 +94,7 @@ def placed_images(
     """
     path = images.path
     for key in ("SeriesInstanceUID", "FrameOfReferenceUID"):
-        if len({text(file, key) for file in images.files}) > 1:
+        if len({read_text(file, key) for file in images.files}) > 1:
             raise VolumeError(
                 f"{path}: and the other files are of several series; give the files of one"
             )
@@ -136,7 +136,7 @@ def _why_flat(images: GreyImages, planes: Sequence[Plane]) -> str:
         return "is one slice of a volume; put the files of its series into one folder, and name it"
     if planes:
         return f"holds {count} images at one place, one after another in time, and no volume"
-    if numbers(images.files[0], "ImagePositionPatient", 3):
+    if read_numbers(images.files[0], "ImagePositionPatient", 3):
         return (
             "states where its images lie, but not the size of pixels: say it with `us-sim import "
             "--spacing X,Y,Z` (mm)"
@@ -171,7 +171,7 @@ def _grid_of(path: str, planes: Sequence[Plane]) -> tuple[NDArray[np.float64], N
             f"to {off:g} mm against an even grid: one may be missing"
         )
     rows, columns = planes[0].spacing
-    return slices, checked_placement(path, (columns, rows, step), axes, first)
+    return slices, make_placement(path, (columns, rows, step), axes, first)
 
 
 def _image_axes(path: str, orientation: Sequence[float]) -> NDArray[np.float64]:
@@ -200,7 +200,7 @@ def _stated_planes(header: Any, frames: int, given: Sequence[float]) -> list[Pla
     - Several images with one position, and the distance of each (`GridFrameOffsetVector`) or of
       all (`SpacingBetweenSlices`).
     """
-    if any(groups := groups_of(header, frames)):
+    if any(groups := read_functional_groups(header, frames)):
         planes = [
             Plane(
                 _found(each, 3, "PlanePositionVolume ImagePositionVolume",
@@ -215,15 +215,15 @@ def _stated_planes(header: Any, frames: int, given: Sequence[float]) -> list[Pla
         ]  # fmt: skip
         stated = (plane.position and plane.orientation and plane.spacing for plane in planes)
         return planes if all(stated) else []
-    position = numbers(header, "ImagePositionPatient", 3)
-    orientation = numbers(header, "ImageOrientationPatient", 6)
-    spacing = numbers(header, "PixelSpacing", 2) or tuple(given[1::-1])
+    position = read_numbers(header, "ImagePositionPatient", 3)
+    orientation = read_numbers(header, "ImageOrientationPatient", 6)
+    spacing = read_numbers(header, "PixelSpacing", 2) or tuple(given[1::-1])
     if position and orientation and spacing and frames == 1:
         return [Plane(position, orientation, spacing)]
     # FrameTime, FrameTimeVector
-    is_cine = {0x00181063, 0x00181065} & set(values(header, "FrameIncrementPointer"))
-    between = number(header, "SpacingBetweenSlices")
-    offsets = numbers(header, "GridFrameOffsetVector", frames)
+    is_cine = {0x00181063, 0x00181065} & set(read_values(header, "FrameIncrementPointer"))
+    between = read_number(header, "SpacingBetweenSlices")
+    offsets = read_numbers(header, "GridFrameOffsetVector", frames)
     if between and not offsets:
         offsets = tuple(n * between for n in range(frames))
     if not (spacing and offsets) or frames == 1 or is_cine:
@@ -238,8 +238,8 @@ def _found(groups: tuple[Any, ...], count: int, *places: str) -> tuple[float, ..
     """Read the numbers at the first of some places, a sequence and an element of its item."""
     for group in groups:
         for sequence, key in map(str.split, places):
-            for item in items(group, f"{sequence}Sequence")[:1]:
-                if found := numbers(item, key, count):
+            for item in read_items(group, f"{sequence}Sequence")[:1]:
+                if found := read_numbers(item, key, count):
                     return found
     return ()
 
@@ -251,5 +251,5 @@ def _time_of(groups: tuple[Any, ...]) -> float:
 
 def _kind_of(groups: tuple[Any, ...]) -> str:
     """Read the kind of an image's values; empty where none is stated."""
-    types = (item for group in groups for item in items(group, "ImageDataTypeSequence"))
-    return next((text(item, "DataType") for item in types), "")
+    types = (item for group in groups for item in read_items(group, "ImageDataTypeSequence"))
+    return next((read_text(item, "DataType") for item in types), "")
