@@ -96,8 +96,8 @@ def test_the_solvers_test_holds():
 @pytest.mark.usefixtures("installed")
 def test_the_solvers_equations_hold_and_its_entry_can_be_made():
     equations = names_of(file("foundation_equations.py"))["foundation_equations"]
-    (entry,) = (code for code in blocks("python") if code.startswith("TissueMethod("))
-    known = {"TissueMethod": EvaluatedMethod, "foundation_equations": equations}
+    (entry,) = (code for code in blocks("python") if code.startswith("EvaluatedMethod("))
+    known = {"EvaluatedMethod": EvaluatedMethod, "foundation_equations": equations}
     method = eval(entry, known)
     for setting in method.settings:
         solver = create_solver(method.name, TissueModel.make_block(nodes=(21, 21, 6)), **setting)
