@@ -27,7 +27,7 @@ def enable_control(control: DisableableElement, is_on: bool = True) -> None:
 
 
 async def set_parameter(node: NodeParameters, name: str, value: Any) -> str:
-    """Set a parameter as `NodeParameters.set_parameter` does; return why it was refused, or nothing."""
+    """Set a parameter as `NodeParameters.set_value` does; return why it was refused, or nothing."""
     return find_refusal() or await node.set_value(name, value)
 
 
