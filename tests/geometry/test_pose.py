@@ -38,7 +38,9 @@ def test_composition_is_associative_and_is_the_matrix_product(a, b, c):
 def test_inverse_undoes(pose):
     np.testing.assert_allclose((pose @ pose.inverse()).matrix, np.eye(4), atol=1e-12)
     points = np.array([[0.1, -0.2, 0.3]])
-    np.testing.assert_allclose(pose.inverse().apply(pose.apply(points)), points, atol=1e-12)
+    np.testing.assert_allclose(
+        pose.inverse().transform_points(pose.transform_points(points)), points, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize(

@@ -129,7 +129,7 @@ def test_a_fresh_image_is_sent_with_its_stamp_and_outlines(bench, show):
     labels = np.zeros((120, 160), np.uint8)
     labels[40:80, 40:100] = 6
     node.annotated.on_usable_pose()
-    node.annotated.show(Shown(GREY_IMAGE, labels), stamp)
+    node.annotated.publish_frame(Shown(GREY_IMAGE, labels), stamp)
     bench.spin_until(lambda: any(message.header.stamp.sec for message in pictures))
     message = pictures[-1]
     assert (message.encoding, message.step) == ("rgb8", 480)
@@ -145,7 +145,7 @@ def test_a_fresh_image_is_sent_with_its_stamp_and_outlines(bench, show):
 def test_nothing_is_drawn_and_no_label_is_cut_for_nobody(bench, show):
     node = show()
     node.annotated.on_usable_pose()
-    node.annotated.show(Asked(), node.stamp())
+    node.annotated.publish_frame(Asked(), node.stamp())
     bench.spin_for(40)
     assert not Asked.called
 
@@ -154,9 +154,9 @@ def test_colours_are_laid_over_the_image_and_others_are_refused(bench, show):
     node = show(lockstep=True, streams=[Reds()])
     pictures = subscribed(bench, node)
     assert node.set_parameters([Parameter("overlay", value="strain")])[0].successful
-    node.annotated.show(Shown(GREY_IMAGE), node.stamp())
+    node.annotated.publish_frame(Shown(GREY_IMAGE), node.stamp())
     assert node.set_parameters([Parameter("overlay", value="none")])[0].successful
-    node.annotated.show(Shown(GREY_IMAGE), node.stamp())
+    node.annotated.publish_frame(Shown(GREY_IMAGE), node.stamp())
     bench.spin_until(lambda: len(pictures) == 2)
     assert picture(pictures[0])[90, 100].tolist() == [172, 45, 45]
     assert picture(pictures[0])[90, 20].tolist() == [90, 90, 90]
@@ -169,7 +169,7 @@ def test_flipped_and_beside_the_plain_image_while_it_runs(bench, show):
     plain = np.tile(np.arange(160, dtype=np.uint8), (120, 1))
     for name in ("flip", "beside"):
         assert node.set_parameters([Parameter(name, value=True)])[0].successful
-        node.annotated.show(Shown(plain), node.stamp())
+        node.annotated.publish_frame(Shown(plain), node.stamp())
     bench.spin_until(lambda: len(pictures) == 2)
     flipped, both = map(picture, pictures)
     assert flipped[60, 159 - 60].tolist() == [60, 60, 60]
@@ -190,9 +190,9 @@ def test_colours_that_the_scene_cannot_provide_are_refused(show):
 def test_colours_that_cannot_be_made_are_said_and_the_image_is_shown(bench, show):
     node = show(lockstep=True, streams=[Broken()], overlay="strain")
     pictures = subscribed(bench, node)
-    node.annotated.show(Shown(GREY_IMAGE), node.stamp())
+    node.annotated.publish_frame(Shown(GREY_IMAGE), node.stamp())
     bench.spin_until(lambda: pictures)
-    assert node.health.problems("overlay") == 1
+    assert node.health.problem_count("overlay") == 1
     assert picture(pictures[0])[90, 100].tolist() == [90, 90, 90]
 
 
@@ -201,7 +201,7 @@ def test_without_new_poses_the_last_image_is_frozen_marked_and_keeps_its_stamp(b
     pictures = subscribed(bench, node)
     stamp = node.stamp()
     node.annotated.on_usable_pose()
-    node.annotated.show(Shown(GREY_IMAGE), stamp)
+    node.annotated.publish_frame(Shown(GREY_IMAGE), stamp)
     bench.spin_until(lambda: pictures and frame(pictures[-1]) == AMBER)
     assert node.annotated.state == "stale"
     bench.spin_until(lambda: frame(pictures[-1]) == RED)
@@ -211,7 +211,7 @@ def test_without_new_poses_the_last_image_is_frozen_marked_and_keeps_its_stamp(b
     assert all((picture(message)[60, 20:100] == 90).all() for message in marked)
     fresh = node.stamp()
     node.annotated.on_usable_pose()
-    node.annotated.show(Shown(GREY_IMAGE), fresh)
+    node.annotated.publish_frame(Shown(GREY_IMAGE), fresh)
     bench.spin_until(lambda: pictures[-1].header.stamp == fresh)
     assert frame(pictures[-1]) == [90, 90, 90]
     assert node.annotated.state == "live"
@@ -220,12 +220,12 @@ def test_without_new_poses_the_last_image_is_frozen_marked_and_keeps_its_stamp(b
 def test_diagnostics_say_once_that_poses_stay_away_and_that_they_are_back(bench, show):
     node = show(stale_after=1.0, lost_after=1.5)  # looked at five times a second
     bench.spin_until(lambda: node.health.values.get("probe_pose") == "waiting")
-    assert node.health.problems("pose age") == 0
+    assert node.health.problem_count("pose age") == 0
     for times in (1, 2):
         node.annotated.on_usable_pose()
         bench.spin_until(lambda: node.health.values["probe_pose"] == "live")
         bench.spin_until(lambda: node.health.values["probe_pose"] == "lost")
-        assert node.health.problems("pose age") == times
+        assert node.health.problem_count("pose age") == times
 
 
 @pytest.mark.parametrize("age", [95_332_936.7, -3600.0])  # a path of years ago, a clock ahead
@@ -236,7 +236,7 @@ def test_poses_of_another_clock_are_live_when_they_come_and_missed_when_they_do_
     pictures = subscribed(bench, node)
     stamp = node.stamp(age)
     node.annotated.on_usable_pose()
-    node.annotated.show(Shown(GREY_IMAGE), stamp)
+    node.annotated.publish_frame(Shown(GREY_IMAGE), stamp)
     assert node.annotated.state == "live"
     bench.spin_until(lambda: pictures and pictures[-1].header.stamp == stamp)
     assert frame(next(p for p in pictures if p.header.stamp == stamp)) == [90, 90, 90]
@@ -256,7 +256,7 @@ def test_an_image_that_lags_behind_live_poses_is_marked(bench, show):
     pictures = subscribed(bench, node)
     first = node.stamp()
     node.annotated.on_usable_pose()
-    node.annotated.show(Shown(GREY_IMAGE), first)
+    node.annotated.publish_frame(Shown(GREY_IMAGE), first)
 
     def is_marked():
         node.annotated.on_usable_pose()
@@ -286,7 +286,7 @@ def test_in_lockstep_nothing_ages(bench, show):
     for second in (1, 2):  # 1970
         stamp = pose_at(0.0, second).header.stamp
         node.annotated.on_usable_pose()
-        node.annotated.show(Shown(GREY_IMAGE), stamp)
+        node.annotated.publish_frame(Shown(GREY_IMAGE), stamp)
     bench.spin_until(lambda: len(pictures) == 2)
     bench.spin_for(40)
     assert [message.header.stamp.sec for message in pictures] == [1, 2]

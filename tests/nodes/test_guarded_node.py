@@ -90,13 +90,13 @@ def test_bad_input_is_refused_by_its_kind_and_is_no_failure(bench, broken):
     poses = bench.publisher(PoseStamped, "pose")
     broken.error = PoseError("it is nowhere")
     poses.publish(pose_at(0.0, 1))
-    bench.spin_until(lambda: broken.health.problems("pose") == 1)
+    bench.spin_until(lambda: broken.health.problem_count("pose") == 1)
     assert not broken.failures
 
 
 def test_what_is_said_is_one_line_however_a_message_is_quoted(broken):
-    broken.refused("/pose", PoseError("in frame '\x1b[2J\n" + "a" * 10_000))
-    broken.failed("/pose", ValueError("\x07\n" * 10_000))
+    broken.report_bad_input("/pose", PoseError("in frame '\x1b[2J\n" + "a" * 10_000))
+    broken.report_failure("/pose", ValueError("\x07\n" * 10_000))
     for sentence in (broken.health._last_problem, broken.last_failure):
         assert sentence.startswith("/pose: ")
         assert sentence.isprintable()
@@ -125,7 +125,7 @@ def test_a_clock_that_does_not_come_is_said(bench, monkeypatch):
 
 def test_an_answer_does_not_say_that_what_failed_was_done(bench, broken):
     broken.error = RuntimeError("a bug")
-    broken.offer("pull", broken.work)
+    broken.create_command("pull", broken.work)
     client = bench.peer.create_client(Trigger, "broken/pull")
     bench.spin_until(client.service_is_ready)
     answer = client.call_async(Trigger.Request())
@@ -148,7 +148,7 @@ def test_a_source_that_fails_is_reset_and_goes_on(bench, small_scene, tmp_path, 
     poses = bench.collect(PoseStamped, "probe/pose")
     publisher = bench.publisher(PoseStamped, "haptic/pose")
     handle = node._input._handle
-    handle.clutch(True)
+    handle.set_clutch(True)
     with monkeypatch.context() as patched:
         patched.setattr(handle, "take", None)
         publisher.publish(pose_at(0.001, 1))
@@ -166,7 +166,9 @@ def test_latency_counts_from_arrival_where_stamps_are_of_another_clock(broken, s
     for age, expected in ((0.02, 20.0), (95_332_936.7, 5.0), (95_332_936.8, 5.0), (-3600.0, 5.0)):
         broken.arrived = monotonic - 5_000_000
         nanoseconds = now - round(1e9 * age)
-        broken.health.published("out", Time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9))
+        broken.health.count_published(
+            "out", Time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+        )
         late = 1e-6 * (time.monotonic_ns() - monotonic)
         assert expected - 1.0 < broken.health._latencies[-1] < expected + late + 5.0
     (warning,) = (text for level, text in said if level == "warning")
@@ -176,8 +178,8 @@ def test_latency_counts_from_arrival_where_stamps_are_of_another_clock(broken, s
 def test_stamps_of_a_clock_that_goes_ahead_are_told(bench, broken):
     reports = bench.collect(DiagnosticArray, "diagnostics")
     ahead = broken.get_clock().now().nanoseconds + 2 * 10**9
-    broken.health.published("out", Time(sec=ahead // 10**9, nanosec=ahead % 10**9))
-    broken.health.report()
+    broken.health.count_published("out", Time(sec=ahead // 10**9, nanosec=ahead % 10**9))
+    broken.health.publish_report()
     bench.spin_until(lambda: any("ahead" in each.status[0].message for each in reports))
     status = reports[-1].status[0]
     assert status.level == DiagnosticStatus.WARN
@@ -264,14 +266,14 @@ def test_the_level_of_a_report_says_whether_the_node_does_its_work(bench, broken
 
     def report():
         count = len(reports)
-        broken.health.report()
+        broken.health.publish_report()
         bench.spin_until(lambda: len(reports) > count)
         return reports[-1].status[0].level, reports[-1].status[0].message
 
     bench.spin_until(lambda: reports)
     broken.health.state = "working"
     assert report() == (DiagnosticStatus.OK, "working")
-    broken.health.problem("pose", "a pose was no pose")
+    broken.health.count_problem("pose", "a pose was no pose")
     assert report() == (DiagnosticStatus.WARN, "a pose was no pose")
     assert report() == (DiagnosticStatus.OK, "working")
     broken.health.warning = "the newest pose is old"

@@ -33,7 +33,7 @@ def test_ctrl_c_among_imports_is_silent():
 
 WITH_A_THREAD = """
 import os, threading
-from us_sim.nodes.process import go_first
+from us_sim.nodes.process import raise_priority
 def policy():
     return os.sched_getscheduler(threading.get_native_id()) & ~os.SCHED_RESET_ON_FORK
 there, asked, policies = threading.Event(), threading.Event(), []
@@ -44,14 +44,14 @@ def wait():
 early = threading.Thread(target=wait)
 early.start()
 there.wait()
-said = go_first()
+said = raise_priority()
 asked.set()
 early.join()
 late = threading.Thread(target=lambda: policies.append(policy()))
 late.start()
 late.join()
 expected = [os.SCHED_RR, os.SCHED_OTHER] if said == "realtime" else [0, 0]
-go_first(2)
+raise_priority(2)
 print(said, policies == expected, os.sched_getparam(0).sched_priority)
 """
 
@@ -89,7 +89,7 @@ def test_a_node_asks_for_it_and_says_what_it_got(
     monkeypatch.setattr(
         process, "raise_priority", lambda priority: times.append(priority) or "realtime"
     )
-    monkeypatch.setattr(process, "spin_node", lambda _: None)
+    monkeypatch.setattr(process, "spin", lambda _: None)
     monkeypatch.setattr(process.rclpy, "init", lambda **_: None)
     monkeypatch.setattr(process.rclpy, "try_shutdown", lambda: None)
     monkeypatch.setattr(node, "destroy_node", lambda: None)

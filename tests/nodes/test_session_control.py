@@ -69,7 +69,7 @@ def test_the_same_value_again_is_told_too(bench):
 
 def test_what_is_so_is_shown_without_being_asked_for(bench):
     control, simulation = controlled(bench)
-    control.show(SessionControlSettings(scene="leg", record="a.mcap"))
+    control.set_state_parameters(SessionControlSettings(scene="leg", record="a.mcap"))
     assert control.get_parameter("record").value == "a.mcap"
     assert control.values.record == "a.mcap"
     assert not simulation.taken
@@ -84,11 +84,11 @@ def test_pages_follow_and_ask_and_hear_why_not(bench):
     board.add_page()
     bench.spin_until(lambda: control.count_subscribers("session/scenes"))
     arm = ListedScene("arm", "/arm.yaml", description="An arm.", structures=("vein", "artery"))
-    control.tell_scenes([arm, ListedScene("leg", "/leg.yaml", problem="volume: is missing")])
-    control.tell_bags({"a.mcap": "/a.mcap"})
+    control.publish_scenes([arm, ListedScene("leg", "/leg.yaml", problem="volume: is missing")])
+    control.publish_bags({"a.mcap": "/a.mcap"})
     values = {"scene": "arm", "replay_rate": "0.5", "replay_loop": "true", "fraction": "0.40"}
     values["record_note"] = "it lies beside another"
-    control.tell("starting: 2 of 5 nodes", values, "nothing came")
+    control.publish_state("starting: 2 of 5 nodes", values, "nothing came")
     bench.spin_until(lambda: board.state.scene == "arm" and board.bags)
     bench.spin_until(lambda: board.scenes)
     assert [(each.description, each.problem) for each in board.scenes] == [
@@ -129,7 +129,7 @@ def test_counts_go_on_over_restarts_and_strangers_are_not_kept(bench):
     ):
         publisher.publish(message)
     bench.spin_until(lambda: sum(monitor.heard.values()) == 4)
-    assert monitor.count("imager", "images") == 105
+    assert monitor.count_messages("imager", "images") == 105
     assert monitor.heard == {("imager", 7): 2, ("imager", 8): 1, ("imager", 0): 1}
     assert set(monitor.reports) == {"imager"}
 
@@ -140,7 +140,7 @@ def test_what_was_lost_is_reported_at_once_and_the_newest_last(bench):
     publisher = monitor.health._publisher
     bench.spin_until(lambda: publisher.get_subscription_count() > 1)
     reports.clear()
-    monitor.tell_lost([f"loss {k}" for k in range(1, TOLD + 11)])
+    monitor.report_losses([f"loss {k}" for k in range(1, TOLD + 11)])
     bench.spin_until(lambda: reports)
     (status,) = reports[0].status
     told = {item.key: item.value for item in status.values}

@@ -138,7 +138,7 @@ def test_the_graph_goes_along_when_the_clock_jumps_back(graph, back):
     graph.bench.spin_until(lambda: len(graph.images) > 20)
     assert (np.diff(stamps(graph.images)) > 0).all()
     require_sound(graph.reports(2.5))
-    assert not graph.tracker.health.problems("order")
+    assert not graph.tracker.health.problem_count("order")
 
 
 def test_a_recorder_begins_when_simulated_time_does(bench, tmp_path):
@@ -152,7 +152,7 @@ def test_a_recorder_begins_when_simulated_time_does(bench, tmp_path):
     bench.spin_until(said.get_subscription_count)
     said.publish(String(data="yes"))
     bench.spin_until(lambda: recorder.health.received)
-    recorder.stop()
+    recorder.stop_recording()
     assert [message.log_time for message in read_bag(file).read_messages()] == [EPOCH]
 
 

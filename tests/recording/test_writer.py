@@ -26,7 +26,7 @@ WEAK = DEFAULT_QOS._replace(reliability=QosReliability.BEST_EFFORT)
 def write_all(bag, messages):
     for message in messages:
         topic, _, *times, data, number = message
-        bag.write(topic, data, *times, number)
+        bag.write_message(topic, data, *times, number)
 
 
 def mcap_content(file):
@@ -149,7 +149,7 @@ def note_until_full(bag):
     bag.add_topic("/note", STRING)
     for k in count():
         try:
-            bag.write("/note", text(f"{k}" + 100 * "x"), EPOCH + k)
+            bag.write_message("/note", text(f"{k}" + 100 * "x"), EPOCH + k)
         except BagError:
             return k
     return None
@@ -273,8 +273,8 @@ def test_places_that_cannot_be_written(tmp_path, place):
     [
         (lambda bag: bag.add_topic("", STRING), "topic name"),
         (lambda bag: bag.add_topic("/thing", "my_msgs/msg/Unheard"), "my_msgs/msg/Unheard"),
-        (lambda bag: bag.write("/other", HI, EPOCH), "/other"),
-        (lambda bag: (bag.close(), bag.close(), bag.write("/note", HI, EPOCH)), "closed"),
+        (lambda bag: bag.write_message("/other", HI, EPOCH), "/other"),
+        (lambda bag: (bag.close(), bag.close(), bag.write_message("/note", HI, EPOCH)), "closed"),
     ],
 )
 def test_misuse(tmp_path, call, word):

@@ -13,7 +13,7 @@ def session_on(path):
     """As a recording of it would be, with an image for every pose."""
     stamps = [int(stamp) for stamp in path.stamps]
     poses = dict(zip(stamps, path.poses, strict=True))
-    return SimpleNamespace(stamps=lambda _: stamps, poses=poses)
+    return SimpleNamespace(list_stamps=lambda _: stamps, poses=poses)
 
 
 def told(path):
@@ -35,4 +35,4 @@ def test_a_path_that_never_touches_has_its_moments_too():
 
 def test_nothing_to_show():
     with pytest.raises(BagError, match="nothing to show"):
-        pick_moments(SimpleNamespace(stamps=lambda _: [], poses={}))
+        pick_moments(SimpleNamespace(list_stamps=lambda _: [], poses={}))

@@ -110,8 +110,8 @@ def test_the_second_is_refused_until_the_first_has_ended():
 
 
 def test_a_killed_one_leaves_the_domain_free():
-    waits = "with alone_on_domain(): print(flush=True); input()"
-    program = f"from us_sim.run.domain import alone_on_domain\n{waits}"
+    waits = "with lock_domain(): print(flush=True); input()"
+    program = f"from us_sim.run.domain import lock_domain\n{waits}"
     pipe = subprocess.PIPE
     with subprocess.Popen([sys.executable, "-c", program], stdin=pipe, stdout=pipe) as first:
         first.stdout.readline()

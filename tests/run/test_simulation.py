@@ -22,7 +22,7 @@ class Supervisor:
 
     def __init__(self, plan, control):
         self.plan, self.why, self.waiting = plan, "", []
-        self.control = lambda _check, _take, settings: control.show(settings) or control
+        self.add_control = lambda _check, _take, settings: control.set_state_parameters(settings) or control
         self.monitor = SimpleNamespace(reports={})
         self.plans = [plan]
 
@@ -46,16 +46,16 @@ class Control:
         self.values = SessionControlSettings()
         self.told, self.to_player = [], []
 
-    def show(self, settings):
+    def set_state_parameters(self, settings):
         self.values = settings
 
-    def tell(self, state, values, warning=""):
+    def publish_state(self, state, values, warning=""):
         self.told.append((state, values, warning))
 
-    def tell_player(self, node, values):
+    def set_player_parameters(self, node, values):
         self.to_player.append((node, values))
 
-    def tell_bags(self, bags):
+    def publish_bags(self, bags):
         self.bags = bags
 
     def tell_scenes(self, scenes):
@@ -74,8 +74,8 @@ def running(small_scene):
 
 def ask(simulation, control, **values):
     control.values = replace(control.values, **values)
-    simulation.check(control.values, set(values))
-    simulation.take(control.values, set(values))
+    simulation.check_request(control.values, set(values))
+    simulation.apply_request(control.values, set(values))
 
 
 def test_a_recording_and_a_replay_come_and_go_beside_the_nodes(running, tmp_path, monkeypatch):

@@ -49,12 +49,12 @@ class Monitor:
         self.running = {}
         self.reports, self.messages, self.recordings = {}, {}, {}
         self.heard = Counter()
-        self.tell_lost = self.told.append
+        self.report_losses = self.told.append
 
-    def count(self, *_):
+    def count_messages(self, *_):
         return 7
 
-    def follow(self, _):
+    def follow_nodes(self, _):
         pass
 
     def resolve_topic_name(self, topic):
@@ -113,7 +113,7 @@ def test_a_player_at_its_end_is_no_loss(session):
     supervisor.update()
     assert supervisor.finished
     assert not supervisor.losses
-    assert supervisor.outcome().sentence() == ""
+    assert supervisor.make_outcome().describe_losses() == ""
 
 
 @pytest.mark.parametrize(
@@ -137,7 +137,7 @@ def test_images_that_were_not_to_be_recorded_are_not_lost(tmp_path, settings, lo
 def test_a_path_that_was_never_played_is_a_loss(session):
     supervisor, _, monitor = session
     monitor.reports["path_player"] = {"awaited": "the end of days"}
-    assert "the end of days" in supervisor.outcome().sentence()
+    assert "the end of days" in supervisor.make_outcome().describe_losses()
 
 
 @pytest.mark.parametrize("status", [0, -9, INTERRUPTED])
@@ -161,8 +161,8 @@ def test_a_node_that_is_not_back_in_the_end_is_said(session):
     supervisor.update()
     running["slice_interpolator"].status = -9
     supervisor.update()
-    supervisor.end()
-    assert "was not back" in supervisor.outcome().sentence()
+    supervisor.end_plan()
+    assert "was not back" in supervisor.make_outcome().describe_losses()
 
 
 def test_one_that_was_never_ready_ends_all_unless_a_signal_ended_it(session):
@@ -187,7 +187,7 @@ def test_the_rest_goes_on_without_one_that_is_given_up(session):
         supervisor.update()
     assert len(STARTED) == 3 + 2
     assert supervisor.losses[-1].given_up == "is not started again after 2 restarts"
-    assert "was ended by SIGSEGV" in supervisor.outcome().sentence()
+    assert "was ended by SIGSEGV" in supervisor.make_outcome().describe_losses()
     assert not supervisor.finished
 
 
@@ -223,21 +223,21 @@ def test_a_recorder_goes_on_in_a_further_file_and_all_of_its_own_are_told(sessio
     again = STARTED[3].parameters
     assert (again["file"], again["if_exists"]) == (str(tmp_path / "session.mcap"), "further")
     monitor.recordings |= {"session.mcap": 1, "session_1.mcap": 4, "of_a_stranger.mcap": 77}
-    outcome = supervisor.outcome()
+    outcome = supervisor.make_outcome()
     assert [file.name for file in outcome.files] == ["session.mcap", "session_1.mcap"]
-    assert "0 images were recorded of 7" in outcome.sentence()
-    assert outcome.sentence().endswith("the recording is in session.mcap, session_1.mcap")
+    assert "0 images were recorded of 7" in outcome.describe_losses()
+    assert outcome.describe_losses().endswith("the recording is in session.mcap, session_1.mcap")
 
 
 def test_a_recorder_that_had_to_be_killed_is_a_loss(session, killed):
     supervisor, _, _ = session
     supervisor.update()
     killed.add("path_player")
-    supervisor.end()
+    supervisor.end_plan()
     assert not supervisor.losses
     killed.add("session_recorder")
-    supervisor.end()
-    assert "was killed" in supervisor.outcome().sentence()
+    supervisor.end_plan()
+    assert "was killed" in supervisor.make_outcome().describe_losses()
 
 
 def test_a_node_of_another_simulation_is_told_once(session, capsys):
@@ -257,7 +257,7 @@ def test_another_plan_ends_what_it_lacks_and_then_starts_what_is_new(session):
     skin = NodeProcess("skin_deformer", {"scene": "other"})
     file = STARTED[0].parameters["file"]
     recorder = NodeProcess("session_recorder", {"file": file, "parameters": "others'"})
-    supervisor.change(Plan([recorder, scene, skin]))
+    supervisor.change_plan(Plan([recorder, scene, skin]))
     assert {node for node, each in before.items() if each.is_noted} == {
         "slice_interpolator",
         "path_player",
@@ -270,7 +270,7 @@ def test_another_plan_ends_what_it_lacks_and_then_starts_what_is_new(session):
     assert not supervisor.losses
     # How many images were made while something was recorded is not known then.
     monitor.recordings[str(file)] = 1
-    assert supervisor.outcome().sentence() == ""
+    assert supervisor.make_outcome().describe_losses() == ""
 
 
 @pytest.mark.parametrize(

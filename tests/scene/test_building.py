@@ -160,7 +160,7 @@ def test_a_flow_of_another_label_than_its_structures_name(scene_with):
     scene = scene_with(structures={"deep": {"label": "artery", "flow": FLOW}})
     assert list(scene.flows) == ["deep"]
     assert build_blood(scene, load_volume(scene)).vessels[0].areas.mean() < 3e-5
-    assert "with blood in deep" in scene.parts()[3].reason
+    assert "with blood in deep" in scene.list_parts()[3].reason
 
 
 @pytest.mark.parametrize(

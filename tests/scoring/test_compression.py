@@ -202,7 +202,7 @@ def test_what_comes_after_the_time_counts_no_more():
 )
 def test_points_are_given_by_number_or_place(points, places):
     made = replace(read_exercise("compression").assigned, points=points)
-    assert np.allclose(made.places(0.06), places)
+    assert np.allclose(made.place_points(0.06), places)
 
 
 @pytest.mark.parametrize(("points", "said"), [((0.07,), "60 mm"), ((), "empty"), (0, "empty")])

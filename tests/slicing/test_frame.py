@@ -43,12 +43,12 @@ def scanner():
 @pytest.mark.parametrize("probe", [LINEAR, SECTOR], ids=["linear", "sector"])
 @pytest.mark.parametrize("first", ["pixels", "labels", "located"])
 def test_all_of_a_frame_comes_from_one_cut_in_any_order(scanner, probe, first, monkeypatch):
-    scanner.use(probe, Imaging())
-    slicer = scanner.frame(POSE, MESH.nodes).slicer
+    scanner.apply_settings(probe, Imaging())
+    slicer = scanner.make_frame(POSE, MESH.nodes).slicer
     nodes = pressed(MESH.nodes)
-    plane = probe.plane(POSE)
+    plane = probe.make_plane(POSE)
     image, labels = slicer.image(nodes, plane), slicer.labels(nodes, plane)
-    frame, cut, cuts = scanner.frame(POSE, nodes), slicer._cut, []
+    frame, cut, cuts = scanner.make_frame(POSE, nodes), slicer._cut, []
     monkeypatch.setattr(slicer, "_cut", lambda *state: cuts.append(state) or cut(*state))
     getattr(frame, first)
     np.testing.assert_array_equal(frame.pixels, image)
@@ -65,14 +65,14 @@ def test_all_of_a_frame_comes_from_one_cut_in_any_order(scanner, probe, first, m
     "imaging", [Imaging(elevation_planes=3), Imaging(lateral_resolution=1e-3, gain=3.0)]
 )
 def test_labels_are_of_the_middle_plane_and_of_the_beams(scanner, imaging):
-    scanner.use(SECTOR, imaging)
-    frame = scanner.frame(POSE, pressed(MESH.nodes))
+    scanner.apply_settings(SECTOR, imaging)
+    frame = scanner.make_frame(POSE, pressed(MESH.nodes))
     assert frame.pixels.any()
-    scanner.use(SECTOR, Imaging())
-    np.testing.assert_array_equal(frame.labels, scanner.labels(POSE, frame.nodes))
+    scanner.apply_settings(SECTOR, Imaging())
+    np.testing.assert_array_equal(frame.render_labels, scanner.render_labels(POSE, frame.nodes))
     black = frame.located.elements == BLACK
-    assert black[~frame.plane.is_shown()].all()
-    was = frame.plane.pixels()[black & frame.plane.is_shown()]  # in the mesh, and moved away
+    assert black[~frame.plane.make_shown_mask()].all()
+    was = frame.plane.compute_pixel_positions()[black & frame.plane.make_shown_mask()]  # in the mesh, and moved away
     assert len(was)
     assert (was >= MESH.nodes.min(axis=0) - 1e-9).all()
     assert (was <= MESH.nodes.max(axis=0) + 1e-9).all()
@@ -107,11 +107,11 @@ def test_every_method_says_which_tetrahedron_a_pixel_is_in(method):
 
 
 def test_what_cannot_be_known_of_a_frame_is_said(scanner):
-    scanner.use(LINEAR, Imaging())
+    scanner.apply_settings(LINEAR, Imaging())
     with pytest.raises(MeshError, match="no tissue carries the volume"):
-        _ = scanner.frame(POSE).located
+        _ = scanner.make_frame(POSE).located
     with pytest.raises(MeshError, match="3 deformed nodes"):
-        _ = scanner.frame(POSE, MESH.nodes[:3]).pixels
+        _ = scanner.make_frame(POSE, MESH.nodes[:3]).pixels
     bare = BMode(Volume(arm().intensities, arm().index_to_patient), LINEAR)
     bare.attach_mesh(MESH.nodes, MESH.tetrahedra)
     for nodes in (None, MESH.nodes):

@@ -38,11 +38,11 @@ def displacement(model, pose):
 
 
 def energy_at(model, pose):
-    return model.answer(displacement(model, pose))[0]
+    return model.compute_wrench(displacement(model, pose))[0]
 
 
 def wrench_at(model, pose):
-    return model.answer(displacement(model, pose))[1]
+    return model.compute_wrench(displacement(model, pose))[1]
 
 
 def moved(start, twist):
@@ -440,7 +440,7 @@ def in_the_wall(x=0.0, turn=0.0):
             {"first": lambda b: b.rendering.stop_rendering("not finite")},
             "not finite",
         ),
-        ([in_the_wall()], {"first": lambda b: b.rendering.clutch(True)}, "the clutch is held"),
+        ([in_the_wall()], {"first": lambda b: b.rendering.set_clutch(True)}, "the clutch is held"),
         ([in_the_wall()], {"first": lambda b: setattr(b, "tick", b.tick - 3000)}, "jumped back"),
     ],
 )

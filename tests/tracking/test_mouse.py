@@ -32,7 +32,7 @@ def axes(**deflections):
 
 def drive(device, deflection, seconds, *, rate=100, start=0, buttons=()):
     for tick in range(round(seconds * rate) + 1):
-        probe = device.axes(deflection, buttons, start + round(tick * 1000 / rate) * MS)
+        probe = device.move_probe(deflection, buttons, start + round(tick * 1000 / rate) * MS)
     return probe
 
 

@@ -30,7 +30,7 @@ def at(ms, x=0.0, covariance=None):
 
 
 def take(tracked, *measurements):
-    return [tracked.take(m, m.stamp) for m in measurements]
+    return [tracked.process_measurement(m, m.stamp) for m in measurements]
 
 
 numbers = st.floats(-1.0, 1.0)

@@ -30,7 +30,7 @@ class Scorer:
 
     def __init__(self, simulator):
         self.score, self.picture = Feed(SCORE, rate=None), Feed(PICTURE, rate=None)
-        simulator.add(self.score, self.picture)
+        simulator.add_feeds(self.score, self.picture)
         simulator.ask_scorer = self._take
         self.asked = []
 
@@ -84,7 +84,7 @@ def test_a_blind_exercise_hides_the_truth_and_asks(page, simulator):
         asked.append((name, value))
         return ""
 
-    simulator.nodes.of("scorer").set = answer
+    simulator.nodes.get_node("scorer").set_value = answer
     steps = [{**STEPS[1], "what": what} for what in ("point 1", "thrombus")]
     page.goto(page.address)
     page.locator("#us-panels").click()
@@ -150,14 +150,14 @@ def test_what_the_scorer_says_is_heard_while_a_page_shows_it(bench, heard):
     for feed in (score, picture):
         feed.add_watcher(lambda: None)
     bench.spin_until(lambda: score.sequence and picture.sequence)
-    assert picture.newest().payload == PNG
-    told = score.newest().header
+    assert picture.get_newest().payload == PNG
+    told = score.get_newest().header
     assert (told["name"], told["description"], told["metrics"]) == ("Press", "Press.", {"a": "1"})
     missed = {"what": "5 N", "state": "missed", "seen": "2 s", "target": [[0.0, 0.01, 0.02]]}
     assert told["steps"] == [missed, *[{"what": "", "state": "to do", "seen": ""}] * len(wrong)]
     publisher.publish(DiagnosticArray())
     bench.spin_until(lambda: score.sequence == 2)
-    assert score.newest().header["name"] == ""
+    assert score.get_newest().header["name"] == ""
 
 
 def test_a_frozen_image_is_marked_in_the_recording(bench, heard):

@@ -96,7 +96,7 @@ def test_pictures_keep_their_colours(bench, watcher, kind, topic):
     publisher = bench.publisher(Image, topic)
     publisher.publish(image_message(picture, Time(), "probe"))
     bench.spin_until(lambda: feed.sequence == 1)
-    decoded = cv2.imdecode(np.frombuffer(feed.newest().payload, np.uint8), cv2.IMREAD_COLOR)
+    decoded = cv2.imdecode(np.frombuffer(feed.get_newest().payload, np.uint8), cv2.IMREAD_COLOR)
     assert np.abs(decoded[24, 10].astype(int) - (30, 60, 200)).max() <= 6
     assert decoded[24, 55].max() <= 6
 
@@ -108,7 +108,7 @@ def test_a_jpeg_of_speckle_is_near_what_it_was(bench, watcher):
     publisher = bench.publisher(Image, "ultrasound/image")
     publisher.publish(image_message(smooth, Time(), "probe"))
     bench.spin_until(lambda: feed.sequence == 1)
-    packet = feed.newest()
+    packet = feed.get_newest()
     decoded = cv2.imdecode(np.frombuffer(packet.payload, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert np.abs(decoded.astype(int) - smooth).mean() < 1.5
     assert len(packet.payload) < 0.5 * smooth.size
@@ -126,7 +126,7 @@ def test_an_image_says_where_its_pixels_are_and_what_else_is_known(bench, watche
 
     def newest():
         publisher.publish(image_message(pixels, Time(sec=7), "probe"))
-        packet = feed.newest()
+        packet = feed.get_newest()
         return packet if packet and "matrix" in packet.header else None
 
     packet = bench.spin_until(newest) or newest()
@@ -163,14 +163,14 @@ def test_what_cannot_be_shown_is_said_and_the_next_is_shown(
         setattr(odd, name, value)
     publisher.publish(odd)
     bench.spin_until(lambda: feed.sequence == 1)
-    assert feed.newest() is None
-    assert watcher.health.problems("volume") == 1
+    assert feed.get_newest() is None
+    assert watcher.health.problem_count("volume") == 1
     assert sentence in watcher.health._last_problem
     good = speckle(4, 4, 3)
     sound = image_message(good, Time(), "probe") if kind == "annotated" else None
     publisher.publish(sound or image_message(good[..., 0], Time(), "probe"))
     bench.spin_until(lambda: feed.sequence == 2)
-    assert feed.newest() is not None
+    assert feed.get_newest() is not None
 
 
 def test_posted_work_is_done_in_order_and_a_failure_is_said(bench):
@@ -197,7 +197,7 @@ def test_of_two_images_beside_each_other_the_left_ones_pixels_are_known(bench, w
     def header():
         message = image_message(np.zeros((40, 60, 3), np.uint8), Time(), "probe")
         publisher.publish(message)
-        packet = feed.newest()
+        packet = feed.get_newest()
         return packet.header if packet and "matrix" in packet.header else None
 
     bench.spin_until(header)
@@ -295,12 +295,12 @@ def test_skin_that_cannot_be_used_is_said_and_what_was_there_stays(graph):
     graph.newest("skin_mesh")
     nodes = graph.bench.publisher(PointCloud2, "skin/nodes")
     for wrong in (SQUARE[:3], SQUARE * np.nan):
-        before = graph.node.health.problems("mesh")
+        before = graph.node.health.problem_count("mesh")
         sequence = graph.feeds["skin"].sequence
         nodes.publish(cloud(wrong))
         graph.bench.spin_until(lambda s=sequence: graph.feeds["skin"].sequence > s)
-        assert graph.feeds["skin"].newest() is None
-        assert graph.node.health.problems("mesh") == before + 1
+        assert graph.feeds["skin"].get_newest() is None
+        assert graph.node.health.problem_count("mesh") == before + 1
     nodes.publish(cloud(SQUARE))
     assert graph.newest("skin").header["points"] == 4
 
@@ -331,8 +331,8 @@ def test_tetrahedra_of_nodes_that_there_are_not_are_refused(graph):
     huge[3, 2] = 2**30
     graph.latch(Int32MultiArray, "tissue/tetrahedra", tetrahedra_message(huge))
     graph.feeds["tissue_mesh"].add_watcher(unused)
-    graph.bench.spin_until(lambda: graph.node.health.problems("mesh") > 0)
-    assert graph.feeds["tissue_mesh"].newest() is None
+    graph.bench.spin_until(lambda: graph.node.health.problem_count("mesh") > 0)
+    assert graph.feeds["tissue_mesh"].get_newest() is None
 
 
 def test_structures_are_heard_once_and_carried_from_then_on(graph):
@@ -357,7 +357,7 @@ def test_structures_are_heard_once_and_carried_from_then_on(graph):
     graph.bench.spin_until(lambda: graph.bench.peer.count_subscribers("tissue/structures") == 0)
     assert graph.bench.peer.count_subscribers("tissue/nodes") == 0
     graph.structures.forget_structures()  # another scene has the same mesh
-    assert graph.feeds["structures"].newest() is None
+    assert graph.feeds["structures"].get_newest() is None
     graph.bench.spin_until(lambda: graph.bench.peer.count_subscribers("tissue/structures") == 1)
 
 
@@ -391,7 +391,7 @@ def test_the_probe_comes_with_its_shape_its_pose_and_its_force(graph):
     poses.publish(pose_at(0.012, second=11))  # without a force
     packet = graph.newest("probe", lambda packet: packet.header["stamp"] == str(11 * 10**9))
     assert packet.header["force_age"] == 2.0
-    of_nine = graph.probe.at(str(9 * 10**9))
+    of_nine = graph.probe.find_pose_and_wrench(str(9 * 10**9))
     assert (of_nine["position"][2], of_nine["force"]) == (0.012, [0.0, 0.5, -3.0])
-    assert "force" not in graph.probe.at(str(11 * 10**9))
-    assert graph.probe.at("7") == {}
+    assert "force" not in graph.probe.find_pose_and_wrench(str(11 * 10**9))
+    assert graph.probe.find_pose_and_wrench("7") == {}

@@ -342,7 +342,7 @@ def test_a_parameter_without_a_value_does_not_hide_the_others(bench, pages):
 def test_a_node_without_parameter_services_is_silent(bench, pages, monkeypatch):
     monkeypatch.setattr("us_sim.viewer.remote_parameters.ANSWER_S", 0.1)
     bench.add(Node("mute", context=bench.context, start_parameter_services=False))
-    shown = pages.nodes.of("mute")
+    shown = pages.nodes.get_node("mute")
     pages.call(shown.add_page)
     bench.spin_until(lambda: shown.state == SILENT)
     assert "no parameter" in pages.set("mute", "gain", 1)

@@ -91,7 +91,7 @@ def test_an_exercise_is_not_ended_unasked(page, session, simulator):
     step = {"what": "press", "seen": "", "state": "to do"}
     header = {"name": "compression", "description": "", "scene": "upper_arm", "metrics": {}}
     header |= {"state": "running", "plain": {}, "about": {}, "faults": []}
-    simulator.add(Feed("score"))
+    simulator.add_feeds(Feed("score"))
     simulator.feeds["score"].offer(lambda n: Packet("score", n, {**header, "steps": [step]}, b""))
     page.goto(page.address)
     page.get_by_role("tab", name="Cases").click()  # the panel of the exercise has opened

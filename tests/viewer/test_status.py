@@ -129,7 +129,7 @@ def test_nodes_and_the_force_are_heard_while_somebody_looks(bench):
     node.health.state = "fem"
 
     def heard():
-        node.health.report()
+        node.health.publish_report()
         return any(
             s.name == "tissue_deformer" and s.state == "fem" for s in board.list_nodes(now())
         )
@@ -139,7 +139,7 @@ def test_nodes_and_the_force_are_heard_while_somebody_looks(bench):
     node.health.count_problem("pose", "the pose is nonsense")
 
     def warned():
-        node.health.report()
+        node.health.publish_report()
         return board.find_node("tissue_deformer", now()).problem == "the pose is nonsense"
 
     bench.spin_until(warned)

@@ -65,8 +65,8 @@ def offer_tissue(bench, top):
 
 
 def height(stander):
-    best = stander.surface.find()
-    return None if best is None else best.above(0.0, 0.0).point[2]
+    best = stander.surface.find_surface()
+    return None if best is None else best.find_top(0.0, 0.0).point[2]
 
 
 def test_without_anything_it_is_the_plane(stander):
@@ -76,10 +76,10 @@ def test_without_anything_it_is_the_plane(stander):
 def test_the_upper_side_of_the_tissue(bench, stander):
     offer_tissue(bench, 0.012)
     bench.spin_until(lambda: height(stander) == pytest.approx(0.012))
-    surface = stander.surface.find()
+    surface = stander.surface.find_surface()
     np.testing.assert_allclose(surface.lower, [-0.03, -0.02, 0.012], atol=1e-6)
     np.testing.assert_allclose(surface.upper, [0.03, 0.02, 0.012], atol=1e-6)
-    np.testing.assert_allclose(surface.above(0.0, 0.0).normal, [0, 0, -1], atol=1e-9)
+    np.testing.assert_allclose(surface.find_top(0.0, 0.0).normal, [0, 0, -1], atol=1e-9)
 
 
 def test_the_skin_goes_before_the_tissue(bench, stander):
@@ -92,13 +92,13 @@ def test_the_skin_goes_before_the_tissue(bench, stander):
 
 def test_what_is_offered_is_awaited(bench, stander):
     bench.peer.create_publisher(Mesh, "skin/mesh", LATCHED)
-    bench.spin_until(lambda: stander.surface.find() is None)
+    bench.spin_until(lambda: stander.surface.find_surface() is None)
 
 
 def test_a_skin_that_is_none_is_refused_and_said(bench, stander):
     publisher = bench.peer.create_publisher(Mesh, "skin/mesh", LATCHED)
     publisher.publish(mesh_message(np.zeros((3, 3)), np.array([[0, 1, 2]])))
-    bench.spin_until(lambda: stander.health.problems("mesh") == 1)
+    bench.spin_until(lambda: stander.health.problem_count("mesh") == 1)
     assert "no triangle with an area" in stander.health._last_problem
 
 
@@ -136,7 +136,7 @@ class Page:
 
     @property
     def state(self):
-        packet = self.feed.newest()
+        packet = self.feed.get_newest()
         return packet.header if packet else {"leader": "unknown", "obstacle": "unknown"}
 
     def await_leader(self, name):
@@ -190,9 +190,9 @@ def test_while_blood_or_time_is_watched_the_resting_probe_is_imaged_as_if_it_mov
     bench.spin_until(lambda: len(tracked) >= 2 and page.state.get("is_resting"))
     simulator = page._holder.simulator
     overlay = Parameter("slice_interpolator", "overlay", ParameterKind.TEXT, "velocity")
-    simulator.nodes.of("slice_interpolator").parameters = {"overlay": overlay}
+    simulator.nodes.get_node("slice_interpolator").parameters = {"overlay": overlay}
     for kind in ("m_mode", "spectrum", "annotated"):
-        simulator.add(Feed(kind))
+        simulator.add_feeds(Feed(kind))
         simulator.feeds[kind].add_watcher(page.nothing)
         bench.spin_until(lambda: not page.state["is_resting"])
         simulator.feeds[kind].remove_watcher(page.nothing)

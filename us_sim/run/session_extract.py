@@ -22,7 +22,7 @@ from us_sim.run.session_tables import (
     SECOND,
     WRENCH_STAMPED,
     Progress,
-    list_bodies,
+    list_pose_sources,
     list_topics,
     read_times,
     read_values,
@@ -52,7 +52,7 @@ def write_parts(
         UsSimError: the scene for the areas cannot be read.
     """
     needed = {
-        "poses": list_bodies(bag),
+        "poses": list_pose_sources(bag),
         "wrench": list_topics(bag, WRENCH_STAMPED),
         "images": list_topics(bag, *PIXELS),
         "areas": [name for name in bag.attachments if name == "scene.yaml"],

@@ -32,7 +32,7 @@ from us_sim.run.session_tables import (
     SECOND,
     VALUES,
     Progress,
-    list_bodies,
+    list_pose_sources,
     list_topics,
     read_times,
     read_values,
@@ -196,7 +196,7 @@ class Episode:
         self._actions = [find_whole_name(bag, action)] if action else []
         named = [find_whole_name(bag, name) for name in topics] + self._actions
         self._tracks: list[Track] = []
-        all_known = [*list_topics(bag, *PIXELS, *VALUES), *list_bodies(bag), *self._actions]
+        all_known = [*list_topics(bag, *PIXELS, *VALUES), *list_pose_sources(bag), *self._actions]
         for name in dict.fromkeys(named if topics else all_known):
             try:
                 self._tracks.append(self._read_track(name))

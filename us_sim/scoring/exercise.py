@@ -412,7 +412,7 @@ class Exercise(Settings):
                 known = describe_unknown(name, lines) if lines else f"{name!r} is not known"
                 of = "the vessels of the scene" if lines else "a scan without a scene"
                 raise ScoreError(f"exercise {self.name}: in {of} the structure {known}")
-        attempt: Attempt = self.assigned.begin(lines)
+        attempt: Attempt = self.assigned.begin_attempt(lines)
         attempt.is_blind = self.feedback == "afterwards"
         return attempt
 

@@ -141,10 +141,17 @@ CALIBRATIONS = Choice(
     "calibration",
     key="what",
     error=CalibrationError,
-    camera=Option(f"{_CALIBRATION}:calibrate_photos", f"{_CALIBRATION}_settings:CameraSettings"),
-    pivot=Option(f"{_CALIBRATION}:calibrate_tip", f"{_CALIBRATION}_settings:PivotSettings"),
-    landmarks=Option(
-        f"{_CALIBRATION}:calibrate_registration", f"{_CALIBRATION}_settings:LandmarkSettings"
+    camera=Option(
+        f"{_CALIBRATION}:calibrate_photos", f"{_CALIBRATION}_settings:CameraCalibrationSettings"
     ),
-    time=Option(f"{_CALIBRATION}:calibrate_clock", f"{_CALIBRATION}_settings:ClockSettings"),
+    pivot=Option(
+        f"{_CALIBRATION}:calibrate_tip", f"{_CALIBRATION}_settings:PivotCalibrationSettings"
+    ),
+    landmarks=Option(
+        f"{_CALIBRATION}:calibrate_registration",
+        f"{_CALIBRATION}_settings:LandmarkCalibrationSettings",
+    ),
+    time=Option(
+        f"{_CALIBRATION}:calibrate_clock", f"{_CALIBRATION}_settings:ClockCalibrationSettings"
+    ),
 )

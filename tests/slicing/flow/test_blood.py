@@ -65,24 +65,24 @@ def test_the_rate_through_a_plane_is_that_of_poiseuille(scanner, artery, degrees
     blood = Blood([artery])
     nodes = block().nodes * [1.0, 1.0, squeezed] + [0.0, 0.0, 0.5 * SIDES[2] * (1 - squeezed)]
     for time in (0.0, 0.2):  # at rest, and at another moment of the pulse
-        frame = scanner.frame(tilted(degrees), nodes, time=time)
+        frame = scanner.make_frame(tilted(degrees), nodes, time=time)
         velocity = blood.compute_velocity(frame, beams())
         rate = flow_through(frame, velocity, np.array([0.0, 1.0, 0.0]))
-        expected = artery.flow * float(artery.pulse(time))
+        expected = artery.flow * float(artery.evaluate_pulse(time))
         assert rate == pytest.approx(expected, rel=0.03)
-        whole = ARTERY.mean_velocity * np.pi * RADIUS**2 * float(artery.pulse(time))
+        whole = ARTERY.mean_velocity * np.pi * RADIUS**2 * float(artery.evaluate_pulse(time))
         assert rate == pytest.approx(whole, rel=0.03)
 
 
 def test_the_angle_between_beam_and_vessel_counts_by_its_cosine(scanner, artery):
     blood, seen = Blood([artery]), {}
     for degrees in (5, 15, 30, 45, 60):
-        frame = scanner.frame(tilted(degrees), block().nodes, time=0.0)
+        frame = scanner.make_frame(tilted(degrees), block().nodes, time=0.0)
         velocity, _ = blood.compute_mean_velocities(frame, beams())
         seen[degrees] = np.nanmax(np.abs(velocity))
     axis = {degrees: peak / np.sin(np.radians(degrees)) for degrees, peak in seen.items()}
     assert list(axis.values()) == pytest.approx([2 * ARTERY.mean_velocity] * 5, rel=0.02)
-    upright = scanner.frame(tilted(0), block().nodes, time=0.0)
+    upright = scanner.make_frame(tilted(0), block().nodes, time=0.0)
     across, _ = blood.compute_mean_velocities(upright, beams())
     assert np.nanmax(np.abs(across)) < 0.02 * 2 * ARTERY.mean_velocity
 
@@ -95,7 +95,7 @@ def test_what_flows_in_at_a_narrowing_flows_out(scanner, artery, squeeze, width,
     factor = 1.0 - (1.0 - squeeze) * np.exp(-0.5 * (nodes[:, 1] / width) ** 2)
     nodes[:, 2] = 0.5 * SIDES[2] + (nodes[:, 2] - 0.5 * SIDES[2]) * factor
     blood = Blood([artery])
-    frame = scanner.frame(tilted(15, y), nodes, time=0.0)
+    frame = scanner.make_frame(tilted(15, y), nodes, time=0.0)
     velocity, _ = blood.compute_mean_velocities(frame, beams())
     rate = flow_through(frame, velocity, np.array([0.0, 1.0, 0.0]))
     assert rate == pytest.approx(artery.flow, rel=0.05)
@@ -105,13 +105,13 @@ def test_a_vein_under_a_full_press_shows_none_and_surges_when_it_is_let_go(scann
     blood = Blood([vein])
     pressed = block().nodes.copy()
     pressed[:, 2] = 0.5 * SIDES[2] + 0.2 * (pressed[:, 2] - 0.5 * SIDES[2])
-    blood.advance_to_frame(scanner.frame(tilted(30), block().nodes, time=0.0))
+    blood.advance_to_frame(scanner.make_frame(tilted(30), block().nodes, time=0.0))
     at_rest = vein.flow
     for time in (1.0, 5.0, 20.0):
-        frame = scanner.frame(tilted(30), pressed, time=time)
+        frame = scanner.make_frame(tilted(30), pressed, time=time)
         velocity = blood.compute_velocity(frame, beams())
         assert np.nanmax(np.abs(velocity)) == 0.0
-    frame = scanner.frame(tilted(30), block().nodes, time=20.1)
+    frame = scanner.make_frame(tilted(30), block().nodes, time=20.1)
     assert np.nanmax(np.abs(blood.compute_velocity(frame, beams()))) > 0.0
     assert vein.flow > 2.5 * at_rest
 
@@ -145,4 +145,4 @@ def test_a_flow_across_its_vessel_is_refused(vein):
 
     across = dataclasses.replace(VEIN, direction=(1.0, 0.1, 0.0))
     with pytest.raises(SceneError, match=r"structures\.vessel\.flow\.direction"):
-        vein.require(across)
+        vein.find_flow_sign(across)

@@ -39,7 +39,7 @@ def blood():
 
 
 def frame_at(scanner, time):
-    return scanner.frame(POSE, block().nodes, time=time)
+    return scanner.make_frame(POSE, block().nodes, time=time)
 
 
 def wrapped(velocity, nyquist):
@@ -111,7 +111,7 @@ def test_the_wall_filter_takes_what_is_slow(scanner, blood):
 )
 def test_why_no_colour_is_shown_is_told(scanner, why, fan, given):
     pose = Pose([0.0, 0.0, 0.0], [np.sin(fan / 2), 0.0, 0.0, np.cos(fan / 2)])
-    frame = scanner.frame(pose, block().nodes, time=SYSTOLE)
+    frame = scanner.make_frame(pose, block().nodes, time=SYSTOLE)
     blood = Blood([tube_vessel(ARTERY)]).advance_to_frame(frame)
     air = why is FlowAbsence.NO_CONTACT
     frame.contact = np.full(PROBE.lines, 0.0 if air else 1.0), np.zeros(PROBE.lines)
@@ -187,7 +187,7 @@ class SMALL:
 def test_steered_beams_see_a_vessel_in_the_image_by_the_angle(scanner):
     """Along the tube upright beams see nothing; steered ones the sine of the angle."""
     along = Pose([0.0, 0.0, 0.0], [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
-    frame = scanner.frame(along, block().nodes, time=SYSTOLE)
+    frame = scanner.make_frame(along, block().nodes, time=SYSTOLE)
     blood = Blood([tube_vessel(ARTERY)])
     for steering in (0.0, 0.2, 0.4):
         doppler = ColourDoppler(PROBE, dataclasses.replace(WIDE, steering=steering))
@@ -276,13 +276,13 @@ def middles(columns, settings):
 def test_its_middle_follows_the_pulse(gate_scanner, artery):
     """The axis at the gate's middle is a little faster than what else is in the gate."""
     blood = Blood([artery])
-    frame = gate_scanner.frame(POSE, block().nodes, time=0.0)
+    frame = gate_scanner.make_frame(POSE, block().nodes, time=0.0)
     moments = np.arange(100) / 110
     columns, seen = Spectrum(GATE_PROBE, GATE).compute_columns(blood, frame, moments)
     found = middles(columns, GATE)
     blood.advance_to_frame(frame)
     sign = -np.sign(POSE.rotation[1, 2])
-    axis = 2 * sign * ARTERY.mean_velocity * artery.pulse(moments) * np.sin(TILT)
+    axis = 2 * sign * ARTERY.mean_velocity * artery.evaluate_pulse(moments) * np.sin(TILT)
     assert seen.all()
     assert np.corrcoef(found, axis)[0, 1] > 0.995
     fast = np.abs(axis) > 0.1
@@ -296,7 +296,9 @@ def test_no_column_depends_on_when_frames_come(gate_scanner, artery):
     for times in (np.linspace(2.0, 3.0, 3), np.linspace(2.0, 3.0, 41)):
         blood, spectrum = Blood([artery]), Spectrum(GATE_PROBE, GATE)
         for time in times:
-            picture = spectrum.draw_sweep(blood, gate_scanner.frame(POSE, block().nodes, time=time))
+            picture = spectrum.draw_sweep(
+                blood, gate_scanner.make_frame(POSE, block().nodes, time=time)
+            )
         pictures.append(picture)
     assert np.array_equal(*pictures)
     assert pictures[0].any()
@@ -354,7 +356,7 @@ def test_why_there_is_no_spectrum_is_told_where_none_is_drawn(
 ):
     middle = Pose([0.0, 0.5 * SIDES[2] * np.tan(fan), 0.0])
     pose = middle @ Pose([0.0] * 3, [np.sin(fan / 2), 0.0, 0.0, np.cos(fan / 2)])
-    frame = gate_scanner.frame(pose, block().nodes, time=1.0)
+    frame = gate_scanner.make_frame(pose, block().nodes, time=1.0)
     frame.contact = np.full(GATE_PROBE.lines, coupling), np.zeros(GATE_PROBE.lines)
     depth = 0.5 * SIDES[2] / np.cos(fan)
     slow = dataclasses.replace(ARTERY, peak_velocity=0.2, mean_velocity=0.05)
@@ -365,7 +367,7 @@ def test_why_there_is_no_spectrum_is_told_where_none_is_drawn(
 
 
 def test_there_is_a_spectrum_as_long_as_it_is_on_the_strip(gate_scanner, artery):
-    frame = gate_scanner.frame(POSE, block().nodes, time=1.0)
+    frame = gate_scanner.make_frame(POSE, block().nodes, time=1.0)
     blood = Blood([artery])
     spectrum, _ = strip_of(frame, blood)
     frame.contact = np.zeros(GATE_PROBE.lines), np.zeros(GATE_PROBE.lines)

@@ -91,7 +91,7 @@ def mask(probe, slack):
 @settings(deadline=None, max_examples=150)
 @given(probe)
 def test_shown_pixels_are_those_in_the_outline(probe):
-    shown = probe.plane(Pose()).is_shown()
+    shown = probe.make_plane(Pose()).make_shown_mask()
     assert (mask(probe, -1e-7) <= shown).all()
     assert (shown <= mask(probe, 1e-7)).all()
     np.testing.assert_array_equal(np.isfinite(probe.pixel_beams), [shown, shown])
@@ -123,7 +123,7 @@ def test_shown_pixels_are_those_in_the_outline(probe):
 )
 def test_the_shown_area_is_the_analytic_one_within_a_pixel_all_around(probe, area, perimeter):
     pixel = probe.pixel_spacing
-    found = probe.plane(Pose()).is_shown().sum() * pixel[0] * pixel[1]
+    found = probe.make_plane(Pose()).make_shown_mask().sum() * pixel[0] * pixel[1]
     assert abs(found - area) <= 1e-12 + 0.5 * perimeter * pixel.max()
 
 
@@ -160,7 +160,7 @@ def test_the_plane_is_the_image_to_probe_map_moved_by_the_pose(probe, position, 
     pose = Pose(position, orientation)
     x, z = pixel_positions(probe)
     expected = pose.transform_points(np.stack([x, 0 * x, z], -1).reshape(-1, 3))
-    np.testing.assert_allclose(probe.plane(pose).pixels().reshape(-1, 3), expected, atol=1e-12)
+    np.testing.assert_allclose(probe.make_plane(pose).compute_pixel_positions().reshape(-1, 3), expected, atol=1e-12)
     scale = probe.image_to_probe[:3, :3] / np.append(probe.pixel_spacing, 1.0)
     np.testing.assert_allclose(scale.T @ scale, np.eye(3), atol=1e-12)
     assert np.linalg.det(scale) == pytest.approx(1.0)
@@ -213,7 +213,7 @@ def wire_phantom(pose, wires):
     index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
     at = (
         pose.inverse()
-        .apply(index.reshape(-1, 3) @ to_patient[:3, :3].T + to_patient[:3, 3])
+        .transform_points(index.reshape(-1, 3) @ to_patient[:3, :3].T + to_patient[:3, 3])
         .reshape(*shape, 3)
     )
     squared = np.min(

@@ -348,7 +348,7 @@ def test_points_enter_through_the_plane_that_touches_where_their_way_goes_in(
     assume(cosine > 0.1)  # or it only grazes the shape
     # A probe that moved by the opposite, past a point that stayed.
     last = Pose(pose.position - pose.rotation @ (came - there), pose.orientation)
-    gap, found = probe.find_entry_planes(last, pose, pose.apply(there[None]))
+    gap, found = probe.find_entry_planes(last, pose, pose.transform_points(there[None]))
     found = pose.rotation.T @ found[0]
     off = 1e-6 / (cosine * collider.offset_box[3])  # angle, of a micrometre before the shape
     np.testing.assert_allclose(found, normal, atol=5 * off)

@@ -35,7 +35,7 @@ def test_it_is_scipys_rotation_and_moves_with_the_frames(pose, seed):
     middles = measured.mean(axis=0), CORNERS.mean(axis=0)
     expected, _ = Rotation.align_vectors(CORNERS - middles[1], measured - middles[0])
     np.testing.assert_allclose(found.pose.rotation, expected.as_matrix(), atol=1e-7)
-    moved = register_landmarks(measured, pose.apply(CORNERS))
+    moved = register_landmarks(measured, pose.transform_points(CORNERS))
     np.testing.assert_allclose(moved.pose.matrix, (pose @ found.pose).matrix, atol=1e-9)
     assert moved.fre == pytest.approx(found.fre)
 

@@ -75,7 +75,7 @@ def require_simpleitks(placed, folder):
         np.testing.assert_allclose(placed.placement[:3] @ [*index, 1], expected, atol=1e-9)
     stored = sitk.GetArrayFromImage(image).T.astype(float)
     spread = (stored - stored.min()) / np.ptp(stored) * 255 if np.ptp(stored) > 255 else stored
-    assert np.abs(placed.voxels() - spread).max() <= 0.5 + 1e-9
+    assert np.abs(placed.read_voxels() - spread).max() <= 0.5 + 1e-9
 
 
 def test_series_of_files_lie_where_simpleitk_says(tmp_path):
