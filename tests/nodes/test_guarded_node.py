@@ -150,7 +150,7 @@ def test_a_source_that_fails_is_reset_and_goes_on(bench, small_scene, tmp_path, 
     handle = node._input._handle
     handle.set_clutch(True)
     with monkeypatch.context() as patched:
-        patched.setattr(handle, "take", None)
+        patched.setattr(handle, "measure_body", None)
         publisher.publish(pose_at(0.001, 1))
         bench.spin_until(lambda: node.failures["/haptic/pose"] == 1)
     assert not handle.is_held

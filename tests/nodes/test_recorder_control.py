@@ -220,7 +220,7 @@ def may_write(monkeypatch):
     allowed = threading.Event()
     write = BagWriter.write_message
     monkeypatch.setattr(
-        BagWriter, "write", lambda *arguments: (allowed.wait(30), write(*arguments))
+        BagWriter, "write_message", lambda *arguments: (allowed.wait(30), write(*arguments))
     )
     return allowed
 

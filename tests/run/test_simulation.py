@@ -58,7 +58,7 @@ class Control:
     def publish_bags(self, bags):
         self.bags = bags
 
-    def tell_scenes(self, scenes):
+    def publish_scenes(self, scenes):
         self.scenes = scenes
 
 

@@ -74,7 +74,7 @@ def messages(seed, seconds):
 
 def scanned(exercise, seed, seconds):
     """A scan, after each second of it."""
-    scan = LiveScan(arm(), SimpleNamespace(probe=PROBE, labels=seen), exercise)
+    scan = LiveScan(arm(), SimpleNamespace(probe=PROBE, render_labels=seen), exercise)
     second = 1.0
     for arrival, method, arguments in messages(seed, seconds):
         while arrival > second:
