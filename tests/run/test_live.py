@@ -21,7 +21,9 @@ from us_sim.settings.viewer import ViewerSettings
 )
 def test_a_run_that_waits_says_where_its_page_is(host: str, address: str) -> None:
     plan = Plan([plan_viewer(ViewerSettings(host=host, port=0))])
-    monitor: Any = SimpleNamespace(reports={"viewer": {"port": "8123"}}, count_messages=lambda *_: 0)
+    monitor: Any = SimpleNamespace(
+        reports={"viewer": {"port": "8123"}}, count_messages=lambda *_: 0
+    )
     assert address in _status(plan, monitor)
 
 

@@ -22,7 +22,9 @@ class Supervisor:
 
     def __init__(self, plan, control):
         self.plan, self.why, self.waiting = plan, "", []
-        self.add_control = lambda _check, _take, settings: control.set_state_parameters(settings) or control
+        self.add_control = lambda _check, _take, settings: (
+            control.set_state_parameters(settings) or control
+        )
         self.monitor = SimpleNamespace(reports={})
         self.plans = [plan]
 

@@ -47,13 +47,13 @@ def test_all_of_a_frame_comes_from_one_cut_in_any_order(scanner, probe, first, m
     slicer = scanner.make_frame(POSE, MESH.nodes).slicer
     nodes = pressed(MESH.nodes)
     plane = probe.make_plane(POSE)
-    image, labels = slicer.image(nodes, plane), slicer.labels(nodes, plane)
+    image, labels = slicer.cut_image(nodes, plane), slicer.cut_labels(nodes, plane)
     frame, cut, cuts = scanner.make_frame(POSE, nodes), slicer._cut, []
     monkeypatch.setattr(slicer, "_cut", lambda *state: cuts.append(state) or cut(*state))
     getattr(frame, first)
     np.testing.assert_array_equal(frame.pixels, image)
     np.testing.assert_array_equal(frame.labels, labels)
-    rest = frame.located.rest_index()
+    rest = frame.located.compute_rest_index()
     assert len(cuts) == (1 if first == "pixels" else 2)
     to_index = frame.volume.patient_to_index
     expected = slicer.compute_rest_coordinates(nodes, plane) @ to_index[:3, :3].T + to_index[:3, 3]
@@ -69,10 +69,11 @@ def test_labels_are_of_the_middle_plane_and_of_the_beams(scanner, imaging):
     frame = scanner.make_frame(POSE, pressed(MESH.nodes))
     assert frame.pixels.any()
     scanner.apply_settings(SECTOR, Imaging())
-    np.testing.assert_array_equal(frame.render_labels, scanner.render_labels(POSE, frame.nodes))
+    np.testing.assert_array_equal(frame.labels, scanner.render_labels(POSE, frame.nodes))
     black = frame.located.elements == BLACK
     assert black[~frame.plane.make_shown_mask()].all()
-    was = frame.plane.compute_pixel_positions()[black & frame.plane.make_shown_mask()]  # in the mesh, and moved away
+    shown = frame.plane.make_shown_mask()
+    was = frame.plane.compute_pixel_positions()[black & shown]  # in the mesh, and moved away
     assert len(was)
     assert (was >= MESH.nodes.min(axis=0) - 1e-9).all()
     assert (was <= MESH.nodes.max(axis=0) + 1e-9).all()

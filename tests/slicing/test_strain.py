@@ -50,7 +50,10 @@ def turned(turn):
 
 def beams_of(frame):
     """(rows, columns, 3) unit directions in ``patient``, from the geometry of each kind."""
-    probe, pixels = frame.probe, frame.pose.inverse().transform_points(frame.plane.compute_pixel_positions())
+    probe, pixels = (
+        frame.probe,
+        frame.pose.inverse().transform_points(frame.plane.compute_pixel_positions()),
+    )
     x, z = pixels[..., 0], pixels[..., 2]
     if isinstance(probe, LinearProbe):
         local = np.stack([0 * x, 0 * x, 0 * x + 1], axis=-1)

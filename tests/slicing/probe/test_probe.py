@@ -160,7 +160,9 @@ def test_the_plane_is_the_image_to_probe_map_moved_by_the_pose(probe, position, 
     pose = Pose(position, orientation)
     x, z = pixel_positions(probe)
     expected = pose.transform_points(np.stack([x, 0 * x, z], -1).reshape(-1, 3))
-    np.testing.assert_allclose(probe.make_plane(pose).compute_pixel_positions().reshape(-1, 3), expected, atol=1e-12)
+    np.testing.assert_allclose(
+        probe.make_plane(pose).compute_pixel_positions().reshape(-1, 3), expected, atol=1e-12
+    )
     scale = probe.image_to_probe[:3, :3] / np.append(probe.pixel_spacing, 1.0)
     np.testing.assert_allclose(scale.T @ scale, np.eye(3), atol=1e-12)
     assert np.linalg.det(scale) == pytest.approx(1.0)
