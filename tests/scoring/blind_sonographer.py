@@ -92,7 +92,7 @@ def examine_arm(seed):
     hand.look([0.0, 0.0], -0.01, 3)
     line = hand.scan.lines["vein"]
     task = read_exercise(scene.exercise).assigned
-    places = [line.interpolate_point(at) for at in task.places(float(line.lengths[-1]))]
+    places = [line.interpolate_point(at) for at in task.place_points(float(line.lengths[-1]))]
     answers = [hand.examine(place) for place in places]
     held = [str(k) for k, answer in enumerate(answers, 1) if answer == NOT_COMPRESSIBLE]
     hand.scan.set_answers(answers, held[len(held) // 2] if held else NO_THROMBUS)

@@ -38,8 +38,8 @@ def scanned(keys, clot=None, *, beside=False, artery=1.0, rate=5.0):
     positions = LINE.points[0] + np.outer(np.nan_to_num(place), [0.0, 1.0, 0.0])
 
     def section(part):
-        straight, middle = np.full(count, np.pi / 2), np.zeros(count)
-        return VesselSection(times, 1e-5 * part, np.full(count, 1e-5), place, straight, middle)
+        middle = np.zeros(count)
+        return VesselSection(times, 1e-5 * part, np.full(count, 1e-5), place, middle, middle)
 
     return Scan(
         Motion(times, positions, [[0, 0, 0, 1]] * count),

@@ -27,8 +27,8 @@ def scan(left=(0.0, 0.0, 0.0), artery=(0.9, 0.9, 0.9), newtons=(6.0, 6.0, 6.0), 
 
     def section(least):
         area = 1e-5 * (1 - np.outer(1 - np.array(least), PRESS).ravel())
-        straight, middle = np.full(count, np.pi / 2), np.zeros(count)
-        return VesselSection(times, area, np.full(count, 1e-5), along, straight, middle)
+        middle = np.zeros(count)
+        return VesselSection(times, area, np.full(count, 1e-5), along, middle, middle)
 
     return Scan(
         motion,
@@ -76,29 +76,6 @@ def test_a_vessel_is_centred_as_long_as_it_is_in_the_middle():
     assert steps("centre", with_lateral(lateral, 0.0))[0].seen == "held for 4.0 s"
     assert done("centre", with_lateral(lateral, 0.0), duration=4.5) == [False]
     assert done("centre", replace(scan(), sections={})) == [False]
-
-
-def test_a_vessel_is_followed_where_it_is_in_the_middle():
-    along = np.linspace(0.005, 0.055, 15)
-    assert done("follow", with_lateral(0.0, along)) == [True]
-    aside = np.where(along > 0.03, 0.02, 0.0)
-    assert steps("follow", with_lateral(aside, along))[0].seen == "50 % seen"
-    assert done("follow", with_lateral(aside, along)) == [False]
-    assert done("follow", with_lateral(aside, along), part=0.4) == [True]
-
-
-def test_a_view_is_found_near_its_pose_with_its_vessels():
-    seen = scan(left=(0.5, 0.5, 0.5))
-    pose = {"position": LINE.points[30].tolist()}
-    view = {"pose": type(read_exercise("view").assigned.pose)(**pose)}
-    assert done("view", seen, **view) == [True]  # 4 s long
-    assert done("view", seen, **view, duration=4.5) == [False]
-    turned = Motion(seen.motion.times, seen.motion.positions, [[0, 0, 0.2, 0.98]] * 15)
-    assert done("view", replace(seen, motion=turned), **view) == [False]
-    assert done("view", replace(seen, motion=turned), **view, angle=0.5) == [True]
-    hidden = replace(seen.sections["vein"], area=np.zeros(15))
-    unseen = replace(seen, sections={**seen.sections, "vein": hidden})
-    assert done("view", unseen, **view) == [False]
 
 
 def test_every_installed_exercise_can_be_read_and_is_of_a_scene_with_its_vessels():

@@ -83,7 +83,7 @@ def scanned(exercise, seed, seconds):
         getattr(scan, method)(*arguments)
 
 
-@pytest.mark.parametrize("name", ["compression", "follow"])
+@pytest.mark.parametrize("name", ["compression", "centre"])
 def test_the_score_so_far_is_that_of_all_samples_so_far(name):
     exercise = read_exercise(name)
     told = set()

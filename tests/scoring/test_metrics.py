@@ -16,7 +16,7 @@ def table(scan, settings=None):
 
 
 def circle(seconds=4.0, radius=0.03, count=4001):
-    """Once round, always facing inwards: v = 2πr/T, a = v²/r, jerk v³/r²."""
+    """Once round, always facing inwards: v = 2πr/T."""
     turn = np.linspace(0, 2 * np.pi, count)
     zero = 0 * turn
     positions = radius * np.stack([np.cos(turn), np.sin(turn), zero], axis=1)
@@ -33,12 +33,6 @@ def test_a_round_of_a_circle():
         "Rotation Total": 360.0,
         "Average Velocity": speed,
         "Peak Velocity": speed,
-        "Average Acceleration": speed**2 / 30,
-        "Peak Acceleration": speed**2 / 30,
-        "Motion Smoothness": 2 * speed**3 / 30**2,
-        "Dimensionless Squared Jerk": 4**6 * (speed**3 / 30**2) ** 2 / (2 * np.pi * 30) ** 2,
-        "Translational Actions": 0,  # 47 mm/s
-        "Rotational Actions": 1,  # 90 °/s
     }
     assert found.keys() == {(name, "Probe") for name in expected}
     for name, value in expected.items():
@@ -54,18 +48,9 @@ def test_a_press_of_a_triangle():
     assert found["Mean Probe Force in Contact", "Probe"] == pytest.approx(10.05, rel=1e-3)
     assert found["Peak Probe Force", "Probe"] == 20.0
     assert found["Time above 15 N", "Probe"] == pytest.approx(1.0, rel=1e-2)
-    assert found["Force Impulse", "Probe"] == pytest.approx(40.0, rel=1e-6)
     assert force.interpolate_at(np.array([-1.0, 2.0, 7.0])) == pytest.approx(
         [np.nan, 10, np.nan], nan_ok=True
     )
-
-
-def test_a_face_that_goes_round_scans_a_ring_where_it_touches():
-    """It faces along the radius of a circle of 30 mm, 20 mm wide, and touches on half of it."""
-    force = Force(np.array([0.0, 1.999, 2.0, 4.0]), np.array([5.0, 5.0, 0.0, 0.0]))
-    found = table(Scan(circle(), force, width=0.02))
-    ring = np.pi * (40**2 - 20**2)
-    assert found["Area Scanned in Contact", "Probe"] == pytest.approx(ring / 2, rel=2e-3)
 
 
 def test_the_areas_of_a_vessel():
@@ -74,15 +59,12 @@ def test_the_areas_of_a_vessel():
         np.arange(4.0),
         1e-6 * np.array([20.0, 5.0, 1.0, 4.0]),
         1e-6 * np.array([20.0, 20.0, nan, 16.0]),
-        np.zeros(4),
-        np.deg2rad([90.0, 80.0, nan, 70.0]),
-        np.zeros(4),
+        *np.zeros((3, 4)),
     )
     found = table(Scan(circle(), sections={"vein": section}))
     assert found["Mean Area at Rest", "vein"] == pytest.approx(56 / 3)
     assert found["Smallest Area", "vein"] == pytest.approx(4.0)  # what cannot be compared is left
     assert found["Smallest Part of the Area at Rest", "vein"] == pytest.approx(25.0)
-    assert found["Mean Angle to the Vessel", "vein"] == pytest.approx(80.0)
 
 
 def test_a_force_without_its_times_is_refused():

@@ -1,4 +1,4 @@
-"""PerkTutor's published tables, met on its own recordings; movements whose metrics are known."""
+"""PerkTutor's published tables, met on its own recordings; movements whose speeds are known."""
 
 import csv
 import tempfile
@@ -9,16 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import SimpleITK as sitk
-from hypothesis import given
-from hypothesis import strategies as st
 
 from us_sim.errors import ScoreError
 from us_sim.geometry.mesh_file import read_with_meshio
 from us_sim.scoring.metrics import Scan, compute_metrics
 from us_sim.scoring.motion import Motion
 
-NEEDLE = 0.3  # m, TissueDamage.NEEDLE_LENGTH; it points along +z, as its evaluator has by default
-MM, MM2 = 1e3, 1e6
+MM = 1e3
 
 
 def motion(times, matrices):
@@ -112,29 +109,12 @@ def winding(points, triangles):
     ) / (2 * np.pi)
 
 
-def first_hits(begins, ends, triangles):
-    """Where each line first meets the surface (Möller and Trumbore); its end where it does not."""
-    corner, e, f = triangles[:, 0], *(triangles[:, i] - triangles[:, 0] for i in (1, 2))
-    found = ends.copy()
-    for k, (begin, way) in enumerate(zip(begins, ends - begins, strict=True)):
-        h, s = np.cross(way, f), begin - corner
-        det, q = (e * h).sum(axis=1), np.cross(s, e)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v, t = (s * h).sum(axis=1) / det, (q @ way) / det, (f * q).sum(axis=1) / det
-        hit = (u >= -1e-12) & (v >= -1e-12) & (u + v <= 1 + 1e-12) & (t >= 0) & (t <= 1)
-        found[k] = begin + way * min(t[hit], default=1.0)
-    return found
-
-
-def tissue_metrics(moved, matrices, surface):
+def tissue_metrics(moved, surface):
     mesh = read_with_meshio(surface, "no surface")
     triangles = mesh.points[mesh.cells_dict["triangle"]].astype(float) / MM
     inside = np.abs(winding(moved.positions, triangles)) > 0.5
-    base = moved.positions - NEEDLE * matrices[:, :3, 2]
-    entry = first_hits(moved.positions, base, triangles)
     times, speeds = moved.steps[inside[1:]], moved.speeds[inside[1:]]
     return {
-        "Tissue Damage": MM2 * moved.compute_swept_area(entry, inside),
         "Path in Tissue": MM * speeds @ times,
         "Time in Tissue": times.sum(),
     }
@@ -142,70 +122,29 @@ def tissue_metrics(moved, matrices, surface):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "read"), [("Lumbar", lumbar), ("InPlane", in_plane)])
-def test_every_value_of_perk_tutors_tables(shared_data, name, read):
+def test_every_time_and_path_of_perk_tutors_tables(shared_data, name, read):
     folder = shared_data / "perktutor-truth" / name
     times, devices, surface = read(folder)
     with (folder / "TrueMetricsTable.tsv").open() as stream:
         rows = list(csv.DictReader(stream, delimiter="\t"))
-    assert len(rows) == 9
+    rows = [row for row in rows if row["MetricName"] != "Tissue Damage"]  # an area of a needle
+    assert len(rows) == 8
     for row in rows:
         device = row["MetricRoles"].split(" = ")[1].split(",")[0]
         moved = motion(times, devices[device])
         own = table(moved)
         if row["MetricName"] not in own:
-            own = tissue_metrics(moved, devices[device], surface)
+            own = tissue_metrics(moved, surface)
         assert own[row["MetricName"]] == pytest.approx(float(row["MetricValue"]), rel=1e-5), row
 
 
-def minimum_jerk(length, seconds, count=2001):
-    """Straight from rest to rest (Flash and Hogan, 1985)."""
-    s = np.linspace(0, 1, count)
-    x = length * (10 * s**3 - 15 * s**4 + 6 * s**5)
-    return Motion(
-        seconds * s, np.outer(x, [0.6, 0.0, 0.8]), np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
-    )
-
-
-@given(st.floats(0.01, 1.0), st.floats(0.2, 20.0))
-def test_the_dimensionless_jerk_of_a_minimum_jerk_movement_is_720(length, seconds):
-    moved = minimum_jerk(length, seconds)
-    found = table(moved)
-    assert found["Dimensionless Squared Jerk"] == pytest.approx(720, rel=0.01)
-    squared_jerk = (1e-3 * found["Motion Smoothness"]) ** 2
-    assert squared_jerk == pytest.approx(720 * length**2 / seconds**5, rel=0.01)
-    assert moved.speeds.max() == pytest.approx(1.875 * length / seconds, rel=1e-4)
-    peak = np.linalg.norm(moved.accelerations, axis=1).max()
-    assert peak == pytest.approx(10 / 3**0.5 * length / seconds**2, rel=1e-3)
-
-
-def test_an_action_is_faster_than_50_mm_s_and_ends_after_a_fifth_of_a_second():
-    """Three bursts of 80 mm/s: the pause before the second is too short to end the first."""
-    dt = 0.01
-    fast = np.zeros(500, bool)
-    fast[50:120] = fast[130:200] = fast[300:360] = True
-    fast[400:415] = True  # too short to be one
-    x = np.r_[0, np.cumsum(np.where(fast, 0.08, 0.04) * dt)]
-    turn = np.r_[0, np.cumsum(np.where(fast, 60.0, 40.0) * dt)]
-    half = np.deg2rad(turn) / 2
-    zero = np.zeros_like(x)
-    positions = np.stack([x, zero, zero], axis=1)
+def test_the_angular_speed_is_that_of_the_shorter_turn():
+    half = np.deg2rad(60.0 * 0.01 * np.arange(50)) / 2
+    zero = 0 * half
     orientations = np.stack([zero, np.sin(half), zero, np.cos(half)], axis=1)
     orientations[::2] *= -1  # the same rotations
-    moved = Motion(dt * np.arange(501), positions, orientations)
-    found = table(moved)
-    assert found["Translational Actions"] == found["Rotational Actions"] == 2
-    assert np.rad2deg(moved.angular_speeds[60]) == pytest.approx(60)
-
-
-def test_a_line_that_moves_sideways_sweeps_a_rectangle():
-    y = np.linspace(0, 0.03, 7)
-    positions = np.stack([0 * y, y, 0 * y], axis=1)
-    moved = Motion(np.arange(7.0), positions, np.tile([0, 0, 0, 1], (7, 1)))
-    assert moved.compute_swept_area(np.add(positions, [0.04, 0, 0])) == pytest.approx(0.04 * 0.03)
-    where = [True] * 3 + [False] * 4
-    assert moved.compute_swept_area(np.add(positions, [0.04, 0, 0]), where) == pytest.approx(
-        0.04 * 0.01
-    )
+    moved = Motion(0.01 * np.arange(50), np.zeros((50, 3)), orientations)
+    assert np.rad2deg(moved.angular_speeds) == pytest.approx(60.0)
 
 
 @pytest.mark.parametrize(

@@ -167,7 +167,7 @@ class Scorer(SceneNode):
         first.name = result["name"]
         message = DiagnosticArray(status=[first])
         for step in result["steps"]:
-            places = {key: json.dumps(step[key]) for key in ("target", "pose") if key in step}
+            places = {"target": json.dumps(step["target"])} if "target" in step else {}
             status = _status("step", step["seen"], places, _LEVELS[step["state"]])
             status.name = step["what"]
             message.status.append(status)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,20 +16,22 @@ from us_sim.run.session_summary import IMAGE, Session
 from us_sim.run.session_tables import SECOND
 from us_sim.scene.building import build_probe
 from us_sim.scene.scene import Scene
-from us_sim.scoring.lumen import LumenAreas
+from us_sim.scoring.metrics import VesselSection
 from us_sim.slicing.drawing.label_outlines import snap_to_border, trace_label_outlines
 from us_sim.volume.structure_names import choose_colour
 
 
-def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file: Path) -> None:
+def contact_sheet(
+    session: Session, scene: Scene, sections: Mapping[str, VesselSection], file: Path
+) -> None:
     """Write the picture as PNG.
 
     Raises:
         BagError: the session has no image.
     """
     moments = pick_moments(session)
-    heights = [1.0, *[0.55] * (areas is not None)]
-    figure = Figure(figsize=(15, 5.5 if areas is None else 9.0), layout="constrained")
+    heights = [1.0, *[0.55] * bool(sections)]
+    figure = Figure(figsize=(15, 9.0 if sections else 5.5), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(len(heights), 3, height_ratios=heights)
     probe, first = build_probe(scene), min(session.poses)
@@ -57,8 +59,8 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
         axes.set_title(f"{title}: t = {times[i]:.2f} s, pressed {depth:.1f} mm", fontsize=11)
         axes.set(xlabel="lateral, mm", ylabel="depth, mm" if i == 0 else "")
     figure.suptitle(f"us_sim: {scene.name} ({scene.volume.name})", fontsize=15)
-    if areas is not None:
-        _plot_areas(figure.add_subplot(grid[1, :]), areas, times)
+    if sections:
+        _plot_areas(figure.add_subplot(grid[1, :]), sections, times)
     figure.savefig(file, dpi=80)
 
 
@@ -79,18 +81,18 @@ def pick_moments(session: Session) -> dict[str, int]:
     }
 
 
-def _plot_areas(axes: Any, areas: LumenAreas, moments: Sequence[float]) -> None:
-    for name in areas.area:
-        colour, percent = choose_colour(name), 100 * areas.compute_fraction(name)
-        axes.plot(areas.time, percent, color=colour, label=f"{name} lumen", lw=2)
+def _plot_areas(axes: Any, sections: Mapping[str, VesselSection], moments: Sequence[float]) -> None:
+    for name, section in sections.items():
+        colour, percent = choose_colour(name), 100 * section.fraction
+        axes.plot(section.times, percent, color=colour, label=f"{name} lumen", lw=2)
     axes.set(xlabel="time, s", ylabel="area, % of the same plane at rest")
     axes.set_ylim(bottom=0)
     axes.margins(x=0.01)
     for moment in moments:
         axes.axvline(moment, color="0.8", lw=1, zorder=0)
     press = axes.twinx()
-    press.plot(areas.time, areas.depth * 1e3, color="0.5", ls="--", label="probe depth")
+    press.plot(section.times, section.depth * 1e3, color="0.5", ls="--", label="probe depth")
     press.set_ylabel("probe depth, mm")
-    lines = axes.get_lines()[: len(areas.area)] + press.get_lines()
+    lines = axes.get_lines()[: len(sections)] + press.get_lines()
     place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(lines)}
     axes.legend(handles=lines, frameon=False, **place)

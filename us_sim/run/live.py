@@ -256,12 +256,12 @@ def _report(scene: Scene, out: Path, outcome: Outcome, wall: float) -> None:
     with Progress("measuring the recording", 100, "%") as bar:
         session = read_session(*outcome.files)
         meter = session.measure_lumens(scene, 120, lambda done: bar.update(50 * done))
-        areas = meter.collect_areas() if meter is not None else None
-        summary = session.summarize(areas)
+        sections = meter.collect_comparable_sections() if meter is not None else {}
+        summary = session.summarize(sections)
         summary |= {"scene": scene.name, "startup_s": round(outcome.startup, 2)}
         summary |= {"wall_s": round(wall, 2), "lost": list(outcome.losses)}
         bar.update(50, "drawing the contact sheet")
-        contact_sheet(session, scene, areas, out / "contact_sheet.png")
+        contact_sheet(session, scene, sections, out / "contact_sheet.png")
         bar.update(100)
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     latency = summary["latency_ms"]
@@ -272,7 +272,7 @@ def _report(scene: Scene, out: Path, outcome: Outcome, wall: float) -> None:
         f"pose to image p50 {image['p50']:.1f} ms, p99 {image['p99']:.1f} ms; "
         f"to the recorder {recorder['p50']:.1f} ms, {recorder['p99']:.1f} ms"
     )
-    for vessel in areas.area if areas is not None else ():
+    for vessel in sections:
         told = []
         for moment, form in (("at_full_press", "+.0%"), ("after_release", "+.1%")):
             change = summary["areas"][f"{vessel}_change_{moment}"]

@@ -116,15 +116,16 @@ def _write_areas(bag: Bag, folder: Path, progress: Progress) -> Path:
     with unpack_scene(bag) as scene:
         session = read_session(bag.path)
         meter = session.measure_lumens(scene, AREAS, lambda done: progress(done, "areas"))
-    areas = meter.collect_areas() if meter is not None else None
-    if areas is None:
+    sections = meter.collect_comparable_sections() if meter is not None else {}
+    if not sections:
         raise BagError(f"{bag.path}: no image of it cuts a vessel that can be measured")
     first = min(session.poses)
-    stamps = [_seconds(first + round(SECOND * time)) for time in areas.time]
-    table = pd.DataFrame({"stamp_s": stamps, "depth_mm": 1e3 * areas.depth})
-    for name in areas.area:
-        table[f"{name}_mm2"] = 1e6 * areas.area[name]
-        table[f"{name}_at_rest_mm2"] = 1e6 * areas.at_rest[name]
+    section = next(iter(sections.values()))
+    stamps = [_seconds(first + round(SECOND * time)) for time in section.times]
+    table = pd.DataFrame({"stamp_s": stamps, "depth_mm": 1e3 * section.depth})
+    for name, section in sections.items():
+        table[f"{name}_mm2"] = 1e6 * section.area
+        table[f"{name}_at_rest_mm2"] = 1e6 * section.at_rest
     return write_table(folder / "areas.csv", table.round(6))
 
 

@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 
 from us_sim.errors import BagError, ScoreError, UsSimError
-from us_sim.nodes.topics import FROZEN
-from us_sim.recording import MARKER
 from us_sim.recording.path import POSE_STAMPED, ProbePath, is_tracker_recording, read_path
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.run.session_summary import POSE, read_session, unpack_scene
 from us_sim.run.session_tables import SECOND, WRENCH_STAMPED, Progress, list_topics, read_wrenches
-from us_sim.scene.building import build_probe, load_volume
+from us_sim.scene.building import load_volume
 from us_sim.scoring.lumen import find_vessels
 from us_sim.scoring.metrics import Force, Scan
 from us_sim.scoring.motion import Motion
@@ -32,7 +30,7 @@ def read_scan(
     """Read a session, any other bag with poses, or a tracker's recording.
 
     Of a session the probe's poses in frame ``patient`` are taken, and areas where its scene is
-    attached. Without force, areas or marks the scan says so and has none.
+    attached. Without force or areas the scan says so and has none.
 
     Args:
         file: the recording.
@@ -58,16 +56,11 @@ def read_scan(
     missing = [path.note] if path.note else []
     if bag is None:
         return Scan(motion, missing=(*missing, f"force and areas: {file} holds poses alone"))
-    force, frozen, truth = None, None, {}
+    force, truth = None, {}
     try:
         force = _read_force(bag, wrench, begin)
     except ScoreError as error:
         missing.append(f"force: {error}")
-    if f"/{MARKER}" in types:
-        texts = [bag.deserialize(message).data for message in bag.read_messages([f"/{MARKER}"])]
-        frozen = sum(text.startswith(FROZEN) for text in texts)
-    else:
-        missing.append(f"images that were frozen: {file} has no marks on /{MARKER}")
     try:
         truth = _measure_vessels(bag, path, progress)
     except UsSimError as error:
@@ -75,7 +68,7 @@ def read_scan(
     sections = truth.get("sections", {})
     if truth and not any(np.isfinite(each.fraction).any() for each in sections.values()):
         missing.append(f"areas of structures: no image of {file} cuts a vessel of deformed tissue")
-    return Scan(motion, force, frozen=frozen, missing=tuple(missing), **truth)
+    return Scan(motion, force, missing=tuple(missing), **truth)
 
 
 def _read_force(bag: Bag, topic: str | None, begin: int) -> Force:
@@ -113,9 +106,6 @@ def _measure_vessels(bag: Bag, path: ProbePath, progress: Progress) -> dict[str,
         samples = max(_SAMPLES, int(_RATE * path.duration))
         lines, thrombi = find_vessels(load_volume(scene))
         meter = session.measure_lumens(scene, samples, lambda part: progress(part, "areas"), lines)
-    return {
-        "sections": meter.collect_sections() if meter is not None else {},
-        "lines": lines,
-        "thrombi": thrombi,
-        "width": build_probe(scene).width,
-    }
+    sections = meter.collect_sections() if meter is not None else {}
+    long = {name: sections[name] for name in lines if name in sections}
+    return {"sections": long, "lines": lines, "thrombi": thrombi}

@@ -24,7 +24,8 @@ from us_sim.scene.building import build_scanner, load_volume
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 from us_sim.scoring.centre_line import CentreLine
-from us_sim.scoring.lumen import LumenAreas, LumenMeter, find_lumen_labels
+from us_sim.scoring.lumen import LumenMeter, find_lumen_labels
+from us_sim.scoring.metrics import VesselSection
 from us_sim.slicing.b_mode import BMode
 
 IMAGE, POSE, NODES = "/ultrasound/image", "/probe/pose", "/tissue/nodes"
@@ -107,7 +108,7 @@ class Session:
         scanner.attach_mesh(self.rest, self.tetrahedra)
         return numbers, scanner
 
-    def summarize(self, areas: LumenAreas | None) -> dict[str, Any]:
+    def summarize(self, sections: Mapping[str, VesselSection]) -> dict[str, Any]:
         """Sum all up as one JSON-like mapping; times in ms, areas in mm².
 
         A latency is the age of the pose when what followed from it was sent, or, ``end_to_end``,
@@ -130,7 +131,7 @@ class Session:
             "images_per_second": (len(stamps) - 1) / seconds if seconds else 0.0,
             "latency_ms": latency,
             "nodes": self.reports,
-            **({"areas": _summary_of(areas)} if areas is not None else {}),
+            **({"areas": _summary_of(sections)} if sections else {}),
         }
 
 
@@ -139,18 +140,20 @@ def _percentiles(times: pd.DataFrame, until: str) -> dict[str, float]:
     return {"p50": p50, "p99": p99}
 
 
-def _summary_of(areas: LumenAreas) -> dict[str, Any]:
+def _summary_of(sections: Mapping[str, VesselSection]) -> dict[str, Any]:
+    section = next(iter(sections.values()))
+    pressed = int(np.argmax(section.depth >= 0.99 * section.depth.max()))
+    moments = {"at_full_press": pressed, "after_release": len(section.times) - 1}
     result: dict[str, Any] = {
-        "time_s": areas.time.round(4).tolist(),
-        "depth_mm": (areas.depth * 1e3).round(4).tolist(),
+        "time_s": section.times.round(4).tolist(),
+        "depth_mm": (section.depth * 1e3).round(4).tolist(),
     }
-    for name, area in areas.area.items():
-        result[f"{name}_mm2"] = (area * 1e6).round(4).tolist()
-        at_rest = (areas.at_rest[name] * 1e6).round(4)
+    for name, section in sections.items():
+        result[f"{name}_mm2"] = (section.area * 1e6).round(4).tolist()
+        at_rest = (section.at_rest * 1e6).round(4)
         result[f"{name}_at_rest_mm2"] = [None if np.isnan(x) else float(x) for x in at_rest]
-        moments = {"at_full_press": areas.pressed, "after_release": len(areas.time) - 1}
         for moment, sample in moments.items():
-            change = float(areas.compute_fraction(name)[sample] - 1.0)
+            change = float(section.fraction[sample] - 1.0)
             result[f"{name}_change_{moment}"] = None if np.isnan(change) else change
     return result
 

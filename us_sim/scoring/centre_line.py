@@ -1,4 +1,4 @@
-"""A vessel's centre line, found from the labels of a volume, and where an image plane cuts it."""
+"""A vessel's centre line, found from the labels of a volume, and its cut with an image plane."""
 
 from __future__ import annotations
 
@@ -17,18 +17,16 @@ _SMOOTHED = 5  # points, over which the line is straightened: a surface of voxel
 
 
 def compute_voxel_centres(volume: Volume, labels: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """(N, 3) m, the centres of a volume's marked voxels (i, j, k), in frame ``patient``."""
+    """Return the centres (N, 3) m of a volume's marked voxels (i, j, k), in frame ``patient``."""
     matrix = volume.index_to_patient
     return np.asarray(np.argwhere(labels) @ matrix[:3, :3].T + matrix[:3, 3])
 
 
 class PlaneCut(NamedTuple):
-    """Where a plane cuts a centre line."""
+    """The place where a plane cuts a centre line."""
 
     along: float  # m, from the end that is first along the line's main axis
-    angle: float  # rad, between the line and the plane, 0 to a right angle
     lateral: float  # m, along the probe's face, from its middle
-    point: NDArray[np.float64]  # (3,) m
 
 
 @dataclass(frozen=True)
@@ -40,9 +38,9 @@ class CentreLine:
 
     @classmethod
     def from_labels(cls, volume: Volume, labels: NDArray[np.bool_]) -> CentreLine | None:
-        """The line of a volume's marked voxels (i, j, k); None of a structure that is not long.
+        """Make the line of a volume's marked voxels (i, j, k); None of a structure that is short.
 
-        The voxels are cut across their longest axis, and each piece gives its centroid.
+        The voxels are cut across their longest axis, and each piece of 2 mm gives its centroid.
         """
         places = compute_voxel_centres(volume, labels)
         if len(places) < 2:
@@ -65,36 +63,34 @@ class CentreLine:
 
     @property
     def lengths(self) -> NDArray[np.float64]:
-        """(P,) m, of the way to each point."""
+        """(P,) m, the way along the line to each point."""
         steps = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
         return np.concatenate([[0.0], np.cumsum(steps)])
 
     def find_arc_lengths(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N,) m along the line, of its points nearest to these (N, 3) m."""
+        """Return the places (N,) m along the line that are nearest to points (N, 3) m."""
         return np.asarray(self.lengths[cKDTree(self.points).query(points)[1]])
 
     def interpolate_point(self, along: float) -> NDArray[np.float64]:
-        """The point (3,) m of a length along the line."""
+        """Interpolate the point (3,) m at a length along the line."""
         lengths = self.lengths
         return np.array([np.interp(along, lengths, each) for each in self.points.T])
 
     def find_cut(self, pose: Pose, width: float) -> PlaneCut | None:
-        """Where the image plane of a probe, at most so wide (m), cuts the line below its face.
+        """Find the cut of the line with a probe's image plane that is nearest below its face.
 
-        Of several places the one nearest to the face.
+        Args:
+            pose: of the probe, in frame ``patient``.
+            width: m, of the image.
         """
         seen = pose.inverse().transform_points(self.points)
         across = seen[:, 1]
-        found = None
+        nearest, cut = np.inf, None
         for k in np.flatnonzero(across[1:] * across[:-1] <= 0).tolist():
             step = across[k] - across[k + 1]
             part = across[k] / step if step else 0.5
             x, _, z = seen[k] + part * (seen[k + 1] - seen[k])
-            way = self.points[k + 1] - self.points[k]
-            if abs(x) > 0.5 * width or z < 0 or (found and z >= found[0]):
-                continue
-            length = float(np.linalg.norm(way))
-            angle = np.arcsin(min(abs(float(way @ pose.rotation[:, 1])) / length, 1.0))
-            where = float(self.lengths[k] + part * length)
-            found = (z, PlaneCut(where, float(angle), float(x), self.points[k] + part * way))
-        return found[1] if found else None
+            if abs(x) <= 0.5 * width and 0 <= z < nearest:
+                length = np.linalg.norm(self.points[k + 1] - self.points[k])
+                nearest, cut = z, PlaneCut(float(self.lengths[k] + part * length), float(x))
+        return cut

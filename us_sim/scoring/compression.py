@@ -15,17 +15,21 @@ from numpy.typing import NDArray
 
 from us_sim.errors import ScoreError
 from us_sim.scoring.centre_line import CentreLine
-from us_sim.scoring.exercise import LENGTH, PART, Attempt, Fault, Step, Task
+from us_sim.scoring.exercise import Attempt, Fault, Step, Task
 from us_sim.scoring.metrics import Scan
 from us_sim.scoring.settings import ANSWERS, CONTACT_FORCE, NO_ANSWER, NO_THROMBUS
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.slicing.settings import WALLS_TOUCH
 
-_FORCE = Quantity("force", 0.1, 200.0)
+_SPACING = 0.02  # m, between points along the vein
+_MARGIN = 0.008  # m, left out at both ends of the vein
+_TOLERANCE = 0.005  # m, from a point, within which it counts, and within which a press stays
+_OPEN = 0.5  # part of its area at rest from which a vessel counts as open
+_ENOUGH = 10.0  # N, after which a vein that is still open holds a thrombus
 _LOOKED = 0.3  # s, for which a person must see a vein open, or closed, to be sure of it
 _LIGHT = 3.0  # N, below which a probe lies on the skin and does not press
-_EDGE = 3e-3  # m from a thrombus' end, within which nobody can tell
+_EDGE = 3e-3  # m from a thrombus' end, within which both answers are right
 _MM = 1e3
 
 
@@ -33,7 +37,7 @@ _MM = 1e3
 class Compression(Task):
     """Compress a vein point by point.
 
-    Every 2 cm is the interval of Needleman et al., "Ultrasound for lower extremity deep venous
+    Points every 2 cm are those of Needleman et al., "Ultrasound for lower extremity deep venous
     thrombosis", Circulation 137 (2018).
     """
 
@@ -46,21 +50,9 @@ class Compression(Task):
         "number of points, or their places along the vein; not given: as many as there is room for",
         default=None,
     )
-    spacing: float = setting(LENGTH, "between points along the vein", default=0.02)
-    margin: float = setting(Quantity("length", 0.0, 1.0), "left out at both ends", default=0.008)
-    tolerance: float = setting(
-        LENGTH,
-        "from a point, within which it counts, and within which a press stays",
-        default=0.005,
+    force_limit: float = setting(
+        Quantity("force", 0.1, 200.0), "above which a press does not count", default=20.0
     )
-    closed: float = setting(
-        PART, "part of its area that a closed vein may keep", default=WALLS_TOUCH
-    )
-    open: float = setting(PART, "part of its area from which a vessel counts as open", default=0.5)
-    enough: float = setting(
-        _FORCE, "after which a vein that is still open holds a thrombus", default=10.0
-    )
-    force_limit: float = setting(_FORCE, "above which a press does not count", default=20.0)
     lift_between: bool = setting(
         description="whether the probe must leave the skin between two presses; else it is enough "
         "that the vein is open again",
@@ -81,7 +73,7 @@ class Compression(Task):
             raise self.make_error("points", "is empty: name at least one")
 
     def place_points(self, length: float) -> NDArray[np.float64]:
-        """Return the points (N,), m along a vein of that length.
+        """Return the points (N,), m along a vein of that length (m).
 
         Raises:
             ScoreError: a place that was given is not on the vein.
@@ -93,9 +85,9 @@ class Compression(Task):
                     f"which is {_MM * length:.0f} mm long"
                 )
             return np.array(self.points)
-        room = max(length - 2 * self.margin, 0.0)
-        count = self.points or int(room / self.spacing + 1e-9) + 1
-        spacing = self.spacing if self.points is None else room / max(count - 1, 1)
+        room = max(length - 2 * _MARGIN, 0.0)
+        count = self.points or int(room / _SPACING + 1e-9) + 1
+        spacing = _SPACING if self.points is None else room / max(count - 1, 1)
         return np.asarray(
             0.5 * length + spacing * (np.arange(count) - 0.5 * (count - 1)), np.float64
         )
@@ -121,20 +113,21 @@ class _Look(NamedTuple):
     def is_touching(self) -> bool:
         return not self.force < CONTACT_FORCE
 
-    def is_pressing(self, is_open: float) -> bool:
-        """Return whether the vein is pressed, by its area or by the force."""
-        return self.is_touching and (self.part < is_open or self.force >= _LIGHT)
+    @property
+    def is_pressing(self) -> bool:
+        """The vein is pressed, by its area or by the force."""
+        return self.is_touching and (self.part < _OPEN or self.force >= _LIGHT)
 
 
 @dataclass
 class _Point:
-    """A point of the vein, and what became of it."""
+    """A point of the vein, and the state of its examination."""
 
     at: float  # m along the vein
     place: NDArray[np.float64]  # (3,) m, the same in frame ``patient``
     is_done: bool = False
     seen: str = "not reached"
-    is_examined: bool = False  # by a press that counts, whatever it showed
+    is_examined: bool = False  # by a press that counts
     most: float | None = None  # N, of the last press; None where there was none
     answer: str = ""  # of `ANSWERS`
 
@@ -152,17 +145,17 @@ class _Press:
     closed: tuple[float, float] | None = None  # N, and the part of the artery that was open
     _closed_since: float | None = field(default=None, repr=False)  # s
 
-    def add_look(self, look: _Look, task: Compression) -> None:
-        """Take an image of it."""
+    def add_look(self, look: _Look) -> None:
+        """Add an image of it."""
         self.most = max(self.most, float(np.nan_to_num(look.peak)))
         if look.part < self.least:
             self.least, self.force = look.part, look.force
-        if not look.part <= task.closed:
+        if not look.part <= WALLS_TOUCH:
             self._closed_since = None
             return
         if self._closed_since is None:
             self._closed_since = look.time
-        is_better = self.closed is None or self.closed[1] < task.open <= look.artery
+        is_better = self.closed is None or self.closed[1] < _OPEN <= look.artery
         if look.time - self._closed_since >= _LOOKED and is_better:
             self.closed = look.force, look.artery
 
@@ -188,11 +181,7 @@ class _Examination(Attempt):
         self._answer = ""  # where the thrombus is: a point's number, or that there is none
 
     def set_answers(self, points: Sequence[str], thrombus: str, time: float) -> None:
-        """Take the learner's answers; the last one ends the attempt.
-
-        Raises:
-            ScoreError: nothing is asked, it has ended, or an answer will not do.
-        """
+        """Set the learner's answers, see `Attempt.set_answers`."""
         numbers = [str(k + 1) for k in range(len(self._points))]
         if not self.is_blind:
             super().set_answers(points, thrombus, time)
@@ -211,7 +200,7 @@ class _Examination(Attempt):
             self.ended = time
 
     def add_samples(self, scan: Scan) -> None:
-        """Take the images that are new."""
+        """Add the images that are new."""
         task = self._task
         self._thrombus = scan.thrombi.get(task.structure, self._thrombus)
         section, artery = (scan.sections.get(name or "") for name in (task.structure, task.artery))
@@ -237,15 +226,15 @@ class _Examination(Attempt):
 
     def list_steps(self) -> list[Step]:
         """Return one step for each point, and one for the time if it is limited."""
-        pressed = self._pressed()
+        pressed = self._find_pressed()
         steps = []
         for number, point in enumerate(self._points, 1):
             what = f"{number}: {self._task.structure} at {_MM * point.at:.0f} mm"
             if self.is_blind:
                 steps.append(self._hidden_step(f"point {number}", point))
                 continue
-            seen = self._tell_press() if point is pressed and not point.is_done else point.seen
-            is_here = abs(self._along - point.at) <= self._task.tolerance
+            seen = self._describe_press() if point is pressed and not point.is_done else point.seen
+            is_here = abs(self._along - point.at) <= _TOLERANCE
             is_missed = point.most is not None and not (point.is_done or is_here)
             steps.append(Step(what, point.is_done, seen, point.place[None], is_missed=is_missed))
         if self.is_blind:
@@ -278,7 +267,7 @@ class _Examination(Attempt):
         return Step("thrombus", is_right, seen, is_missed=not is_right)
 
     def _truths(self, point: _Point) -> tuple[str, ...]:
-        """Return the right answers on a point: both within 3 mm of a thrombus' end."""
+        """Return the right answers on a point; both are right within 3 mm of a thrombus' end."""
         (begin, end), (compressible, not_compressible, _) = self._thrombus, ANSWERS
         inside = min(point.at - begin, end - point.at)
         if abs(inside) <= _EDGE:
@@ -300,43 +289,42 @@ class _Examination(Attempt):
             self.ended = look.time
             return
         self._along = look.along if np.isfinite(look.along) else self._along
-        presses = look.is_pressing(task.open)
-        if self._press is None and presses:
-            self._press = _Press(look.along, self._early(look))
+        if self._press is None and look.is_pressing:
+            self._press = _Press(look.along, self._explain_early(look))
         if self._press is not None:
-            self._press.add_look(look, task)
+            self._press.add_look(look)
             self._check_place(look, self._press)
         self._check_force(look)
         self._was_lifted |= not look.is_touching
-        if self._press is not None and not presses:
+        if self._press is not None and not look.is_pressing:
             self._finish(self._press)
         self._see_open(look)
         if not self.is_blind and all(point.is_done for point in self._points):
             self.ended = look.time
 
     def _see_open(self, look: _Look) -> None:
-        """Note since when, and where, the vein is seen open."""
-        if not look.is_touching or look.is_pressing(self._task.open):
+        """Note the time since when, and the place where, the vein is seen open."""
+        if not look.is_touching or look.is_pressing:
             self._open = None
             return
-        is_elsewhere = self._open and abs(look.along - self._open[1]) > self._task.tolerance
-        if look.part >= self._task.open and (self._open is None or is_elsewhere):
+        is_elsewhere = self._open and abs(look.along - self._open[1]) > _TOLERANCE
+        if look.part >= _OPEN and (self._open is None or is_elsewhere):
             self._open = look.time, look.along
 
-    def _early(self, look: _Look) -> str:
+    def _explain_early(self, look: _Look) -> str:
         """Return why a press that begins does not count; "" if it does so far."""
         if self._task.lift_between and not self._was_lifted:
             return "pressed again without a lift: lift the probe between two presses"
         if self._open is not None:
             since, along = self._open
-            is_there = abs(look.along - along) <= self._task.tolerance
+            is_there = abs(look.along - along) <= _TOLERANCE
             if is_there and self._looked - since >= _LOOKED:
                 return ""
         return "pressed before the vein was seen open there: touch lightly first"
 
     def _check_place(self, look: _Look, press: _Press) -> None:
         slid = abs(look.along - press.along)
-        if look.is_touching and slid > self._task.tolerance and not press.has_slid:
+        if look.is_touching and slid > _TOLERANCE and not press.has_slid:
             press.has_slid = True
             press.problem = f"slid {_MM * slid:.0f} mm under pressure: let go before you slide on"
             self.faults.append(Fault(look.time, press.problem))
@@ -352,54 +340,58 @@ class _Examination(Attempt):
         if self._press is not None and not self._press.problem:
             self._press.problem = problem
 
-    def _pressed(self) -> _Point | None:
+    def _find_pressed(self) -> _Point | None:
         """Return the point that the press is at."""
         if self._press is None:
             return None
         along = self._press.along
         nearest = min(self._points, key=lambda point: abs(point.at - along))
-        return nearest if abs(nearest.at - along) <= self._task.tolerance else None
+        return nearest if abs(nearest.at - along) <= _TOLERANCE else None
 
     def _finish(self, press: _Press) -> None:
-        """Have the point that the press was at know what became of it."""
-        point = self._pressed()
+        """Note the result of the press at its point."""
+        point = self._find_pressed()
         self._press, self._was_lifted = None, False
         if point is None or point.is_done:
             return
         point.most = press.most
-        is_seen = press.closed is not None or press.most >= self._task.enough
+        is_seen = press.closed is not None or press.most >= _ENOUGH
         point.is_examined |= is_seen and not press.problem
         point.is_done, point.seen = self._judge(press, point)
 
     def _judge(self, press: _Press, point: _Point) -> tuple[bool, str]:
-        task = self._task
+        """Return whether the point is done, and words for what was seen."""
         if press.problem:
             return False, press.problem
         if press.closed is not None:
             force, artery = press.closed
-            is_open = artery >= task.open
-            also = "" if is_open else f", and of the {task.artery} {100 * artery:.0f} % were left"
-            return is_open, f"closed{_newtons(force)}{also}"
-        seen = f"{100 * press.least:.0f} % open{_newtons(press.force)}"
-        if press.least <= task.closed:
-            return False, f"closed{_newtons(press.force)} too shortly to be seen"
-        if press.most < task.enough:
+            is_open = artery >= _OPEN
+            also = (
+                ""
+                if is_open
+                else f", and of the {self._task.artery} {100 * artery:.0f} % were left"
+            )
+            return is_open, f"closed{_format_force(force)}{also}"
+        seen = f"{100 * press.least:.0f} % open{_format_force(press.force)}"
+        if press.least <= WALLS_TOUCH:
+            return False, f"closed{_format_force(press.force)} too shortly to be seen"
+        if press.most < _ENOUGH:
             return False, f"{seen}: not pressed enough"
         begin, end = self._thrombus
-        is_thrombus = begin - task.tolerance <= point.at <= end + task.tolerance
+        is_thrombus = begin - _TOLERANCE <= point.at <= end + _TOLERANCE
         return is_thrombus, f"{seen}: {'a thrombus' if is_thrombus else 'not closed'}"
 
-    def _tell_press(self) -> str:
-        """Return what is to be known of the press that goes on."""
+    def _describe_press(self) -> str:
+        """Return words for the press that goes on."""
         press = self._press
         assert press is not None
         if press.problem:
             return press.problem
         if press.closed is not None:
-            return f"closed{_newtons(press.closed[0])}: let go"
-        seen = f"{100 * press.least:.0f} % open{_newtons(press.force)}"
-        return f"{seen}: {'press harder' if press.most < self._task.enough else 'let go'}"
+            return f"closed{_format_force(press.closed[0])}: let go"
+        seen = f"{100 * press.least:.0f} % open{_format_force(press.force)}"
+        return f"{seen}: {'press harder' if press.most < _ENOUGH else 'let go'}"
 
 
-def _newtons(force: float) -> str:
+def _format_force(force: float) -> str:
     return f" at {force:.1f} N" if np.isfinite(force) else ""

@@ -1,4 +1,4 @@
-"""Exercises: what a learner shall do with the probe, read from YAML, and whether a scan did it.
+"""Exercises for a learner with the probe, read from YAML, and attempts at them.
 
 >>> from us_sim.scoring.exercise import read_exercise
 >>> exercise = read_exercise("compression")
@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import ScoreError
-from us_sim.geometry.pose import Placement, Pose
 from us_sim.scoring.centre_line import CentreLine
-from us_sim.scoring.metrics import Scan, VesselSection
+from us_sim.scoring.metrics import Scan
 from us_sim.scoring.settings import CONTACT_FORCE
 from us_sim.settings.choice import ChosenOption
 from us_sim.settings.quantity import Quantity
@@ -33,8 +32,7 @@ from us_sim.settings.spelling import describe_unknown
 from us_sim.settings.text_files import read_yaml
 from us_sim.share import shared_roots
 
-LENGTH, PART = Quantity("length", 1e-4, 1.0), Quantity("number", 0.0, 1.0)
-_TIME, _FORCE = Quantity("time", 0.1, 3600.0), "force"
+_TIME, _FORCE = Quantity("time", 0.1, 3600.0), Quantity("force", 0.01, 200.0)
 _MM = 1e3
 
 
@@ -44,20 +42,16 @@ class Step(NamedTuple):
     what: str
     is_done: bool
     seen: str
-    # (P, 3) m in frame ``patient``, where it is to be done: one point, or those of a line
+    # (P, 3) m in frame ``patient``, the place of it: one point, or those of a line
     target: NDArray[np.float64] | None = None
-    pose: Pose | None = None  # of the probe, that is to be found
-    is_missed: bool = False  # whether it was tried in vain, and the probe has moved on
+    is_missed: bool = False  # it was tried in vain, and the probe has moved on
 
     def to_document(self) -> dict[str, Any]:
         """Return it as JSON, with its ``state``: done, missed, or to do."""
         state = "done" if self.is_done else "missed" if self.is_missed else "to do"
-        told: dict[str, Any] = {"what": self.what, "state": state, "seen": self.seen}
-        if self.target is not None:
-            told["target"] = self.target.round(4).tolist()
-        if self.pose is not None:
-            told["pose"] = [*self.pose.position.tolist(), *self.pose.orientation.tolist()]
-        return told
+        document = {"what": self.what, "state": state, "seen": self.seen}
+        target = {} if self.target is None else {"target": self.target.round(4).tolist()}
+        return document | target
 
 
 class Fault(NamedTuple):
@@ -77,17 +71,17 @@ class Attempt(ABC):
 
     was_in_air = False
     is_blind = False
-    """Whether steps say nothing that an image does not show, until the attempt has ended."""
+    """Until the attempt has ended, steps say nothing that an image does not show."""
     touched: float | None = None
-    """s since the first pose, when the probe touched the skin for the first time."""
+    """s since the first pose, of the probe's first touch; None before."""
     ended: float | None = None
-    """s, when all was done or the time was over; None before."""
+    """s since the first pose, of the end: all was done, or the time was over; None before."""
     faults: Sequence[Fault] = ()
-    """What was done wrong, in order."""
+    """In the order of their times."""
     _time = 0.0  # s, of the last pose
 
     def add_scan(self, scan: Scan) -> None:
-        """Take the samples that are new, from the first in the air on."""
+        """Add the samples that are new, from the first in the air on."""
         times, is_touching = scan.motion.times, np.ones(len(scan.motion), bool)
         if scan.force is not None:
             times, is_touching = scan.force.times, scan.force.newtons >= CONTACT_FORCE
@@ -104,39 +98,39 @@ class Attempt(ABC):
 
     @abstractmethod
     def add_samples(self, scan: Scan) -> None:
-        """Take the samples that are new and count."""
+        """Add the samples that are new and count."""
 
     @abstractmethod
     def list_steps(self) -> list[Step]:
-        """Return every thing that is to be done."""
+        """Return the steps of the task, with what was seen of each."""
 
     def set_answers(self, points: Sequence[str], thrombus: str, time: float) -> None:  # noqa: ARG002
-        """Take the learner's answers so far.
+        """Set the learner's answers so far; the last one ends the attempt.
 
         Args:
             points: one for each point, of `ANSWERS`, or `NO_ANSWER`.
             thrombus: number of a point at it, "none", or "" for no answer yet.
-            time: s, when they were given.
+            time: s since the first pose, of the answers.
 
         Raises:
-            ScoreError: nothing is asked, or an answer will not do.
+            ScoreError: nothing is asked, the attempt has ended, or an answer will not do.
         """
         raise ScoreError("answers: this exercise asks nothing")
 
     def compute_duration(self) -> float | None:
-        """Return the time from the first touch to the end, or so far; None before the first."""
+        """Return the s from the first touch to the end, or so far; None before the first."""
         if self.touched is None:
             return None
         return (self._time if self.ended is None else self.ended) - self.touched
 
 
 class Task(Settings):
-    """Base of what an exercise may ask for."""
+    """Base of the tasks that an exercise may set."""
 
     error: ClassVar = ScoreError
     section: ClassVar = "task"
     asks: ClassVar[bool] = False
-    """Whether it has questions that a learner can answer, where nothing is told."""
+    """It has questions that a learner can answer, where nothing is told."""
 
     @property
     def structures(self) -> tuple[str, ...]:
@@ -145,11 +139,11 @@ class Task(Settings):
 
     @abstractmethod
     def begin_attempt(self, lines: Mapping[str, CentreLine]) -> Attempt:
-        """An attempt at it, in a scene with these vessels."""
+        """Return an attempt at it, in a scene with these vessels."""
 
 
 class _Holding(Attempt):
-    """An attempt to hold something without a break; it ends when that was done long enough."""
+    """An attempt to hold something without a break, which ends when it was held long enough."""
 
     def __init__(self, duration: float) -> None:
         self._duration = duration  # s
@@ -157,6 +151,7 @@ class _Holding(Attempt):
         self._last, self._was = 0.0, False
 
     def _hold(self, times: NDArray[np.float64], within: NDArray[np.bool_]) -> None:
+        """Add samples: their times (K,) s, and whether it was held at each."""
         for time, now in zip(times.tolist(), within.tolist(), strict=True):
             self._held = self._held + time - self._last if now and self._was else 0.0
             self._longest = max(self._longest, self._held)
@@ -176,12 +171,12 @@ class _Holding(Attempt):
 class KeepForce(Task):
     """Press with one force and keep it."""
 
-    force: float = setting(Quantity(_FORCE, 0.01, 200.0), "to press with", default=5.0)
-    tolerance: float = setting(Quantity(_FORCE, 0.01, 200.0), "above and below", default=1.0)
+    force: float = setting(_FORCE, "to press with", default=5.0)
+    tolerance: float = setting(_FORCE, "above and below", default=1.0)
     duration: float = setting(_TIME, "without leaving it", default=5.0)
 
     def begin_attempt(self, lines: Mapping[str, CentreLine]) -> Attempt:  # noqa: ARG002
-        """An attempt with one step."""
+        """Return an attempt with one step."""
         return _KeptForce(self)
 
 
@@ -213,7 +208,9 @@ class Centre(Task):
     """Bring a vessel to the middle of the image and hold it there."""
 
     structure: str = setting(description="vessel to be centred", default="vein")
-    offset: float = setting(LENGTH, "from the image's middle at most", default=0.003)
+    offset: float = setting(
+        Quantity("length", 1e-4, 1.0), "from the image's middle at most", default=0.003
+    )
     duration: float = setting(_TIME, "without losing it", default=3.0)
 
     @property
@@ -222,7 +219,7 @@ class Centre(Task):
         return (self.structure,)
 
     def begin_attempt(self, lines: Mapping[str, CentreLine]) -> Attempt:
-        """An attempt with one step."""
+        """Return an attempt with one step."""
         return _Centred(self, lines[self.structure])
 
 
@@ -236,8 +233,8 @@ class _Centred(_Holding):
         if section is not None:
             new = section.times > scan.since
             self._is_seen |= bool(np.isfinite(section.fraction[new]).any())
-            within = _is_centred(section, self._task.offset)
-            self._hold(section.times[new], within[new])
+            within = np.abs(section.lateral[new]) <= self._task.offset
+            self._hold(section.times[new], within)
 
     def list_steps(self) -> list[Step]:
         task, points = self._task, self._line.points
@@ -245,120 +242,6 @@ class _Centred(_Holding):
         if not self._is_seen:
             return [Step(what, False, "never in the image", points)]
         return [self._step(what)._replace(target=points)]
-
-
-@dataclass(frozen=True)
-class Follow(Task):
-    """Follow a vessel, keeping it in the middle of the image."""
-
-    structure: str = setting(description="vessel to be followed", default="vein")
-    offset: float = setting(LENGTH, "from the image's middle at most", default=0.005)
-    margin: float = setting(Quantity("length", 0.0, 1.0), "left out at both ends", default=0.01)
-    part: float = setting(PART, "of the rest that has to be seen", default=0.9)
-
-    @property
-    def structures(self) -> tuple[str, ...]:
-        """The vessel."""
-        return (self.structure,)
-
-    def begin_attempt(self, lines: Mapping[str, CentreLine]) -> Attempt:
-        """An attempt with one step."""
-        return _Followed(self, lines[self.structure])
-
-
-class _Followed(Attempt):
-    """Pieces of 2 mm that were passed between two images, or seen in one."""
-
-    def __init__(self, task: Follow, line: CentreLine) -> None:
-        self._task, self._line = task, line
-        self._pieces = np.arange(task.margin, line.lengths[-1] - task.margin, 0.002)
-        self._seen = np.zeros(len(self._pieces), bool)
-        self._last: float | None = None  # m along the vessel, where it was centred just before
-
-    def add_samples(self, scan: Scan) -> None:
-        section = scan.sections.get(self._task.structure)
-        if section is None:
-            return
-        new = section.times > scan.since
-        centred = _is_centred(section, self._task.offset)[new]
-        looks = zip(section.times[new].tolist(), section.along[new].tolist(), centred, strict=True)
-        for time, along, now in looks:
-            if now:
-                last = self._last if self._last is not None else along
-                low, high = sorted((last, along))
-                self._seen |= (self._pieces > low - 0.002) & (self._pieces < high + 0.002)
-                if self.ended is None and self._part >= self._task.part:
-                    self.ended = time
-            self._last = along if now else None
-
-    @property
-    def _part(self) -> float:
-        """Of the vessel, that was seen."""
-        return float(self._seen.mean()) if len(self._seen) else 0.0
-
-    def list_steps(self) -> list[Step]:
-        part = self._part
-        what = f"{100 * self._task.part:.0f} % of the {self._task.structure} in the image's middle"
-        return [Step(what, part >= self._task.part, f"{100 * part:.0f} % seen", self._line.points)]
-
-
-@dataclass(frozen=True)
-class View(Task):
-    """Find a standard view: a pose of the probe, with vessels that must be in the image."""
-
-    pose: Placement = setting(description="of the probe, in frame patient")
-    distance: float = setting(LENGTH, "from its position at most", default=0.005)
-    angle: float = setting(Quantity("angle", 1e-3, 3.15), "from its orientation", default=0.17)
-    visible: tuple[str, ...] = setting(description="vessels in the image", default=())
-    duration: float = setting(_TIME, "without leaving it", default=1.0)
-
-    @property
-    def structures(self) -> tuple[str, ...]:
-        """The vessels that must be seen."""
-        return self.visible
-
-    def begin_attempt(self, lines: Mapping[str, CentreLine]) -> Attempt:  # noqa: ARG002
-        """An attempt with one step."""
-        return _Found(self)
-
-
-class _Found(_Holding):
-    def __init__(self, task: View) -> None:
-        super().__init__(task.duration)
-        self._task = task
-        self._nearest = np.inf, np.inf, np.inf  # how far in all, m, rad
-
-    def add_samples(self, scan: Scan) -> None:
-        task, wanted = self._task, self._task.pose.pose
-        new = scan.motion.times > scan.since
-        times = scan.motion.times[new]
-        if not len(times):
-            return
-        apart = np.linalg.norm(scan.motion.positions[new] - wanted.position, axis=1)
-        shared = np.abs(scan.motion.orientations[new] @ wanted.orientation)
-        turned = 2.0 * np.arccos(np.minimum(shared, 1.0))
-        within = (apart <= task.distance) & (turned <= task.angle)
-        for name in task.visible:
-            section = scan.sections.get(name)
-            if section is None:
-                within[:] = False
-                continue
-            last = np.searchsorted(section.times, times, side="right") - 1  # image
-            within &= (last >= 0) & (section.area[last] > 0)
-        self._hold(times, within)
-        best = int(np.argmin(apart / task.distance + turned / task.angle))
-        far = apart[best] / task.distance + turned[best] / task.angle
-        self._nearest = min(self._nearest, (far, apart[best], turned[best]))
-
-    def list_steps(self) -> list[Step]:
-        task = self._task
-        what = f"the view within {_MM * task.distance:g} mm and {np.rad2deg(task.angle):.0f}°"
-        held = self._step(f"{what} for {task.duration:g} s")
-        _, apart, turned = self._nearest
-        if np.isfinite(apart):
-            near = f"nearest {_MM * apart:.1f} mm and {np.rad2deg(turned):.0f}°"
-            held = held._replace(seen=f"{held.seen}; {near}")
-        return [held._replace(pose=task.pose.pose)]
 
 
 @dataclass(frozen=True)
@@ -390,7 +273,7 @@ class Exercise(Settings):
     checksum: str = ""  # of that file: the first 12 digits of its SHA-256
 
     def check(self) -> None:
-        """Refuse to ask where there is no question."""
+        """Refuse feedback afterwards for a task without a question."""
         if self.feedback == "afterwards" and not self.assigned.asks:
             raise self.make_error(
                 "feedback", "afterwards is for a compression, which has questions"
@@ -405,7 +288,7 @@ class Exercise(Settings):
         """Return an attempt at it, in a scene with these vessels.
 
         Raises:
-            ScoreError: some that the task needs are missing; one sentence with the structure.
+            ScoreError: one that the task needs is missing.
         """
         for name in self.assigned.structures:
             if name not in lines:
@@ -417,7 +300,7 @@ class Exercise(Settings):
         return attempt
 
     def evaluate_scan(self, scan: Scan) -> list[Step]:
-        """Steps to be done, with what was seen of each in a whole scan.
+        """Return the steps of the task, with what was seen of each in a whole scan.
 
         Raises:
             ScoreError: as `begin_attempt`.
@@ -431,7 +314,7 @@ def read_exercise(name: str | Path) -> Exercise:
     """Read an exercise: a file, or the name of one in ``config/exercises``.
 
     Raises:
-        ScoreError: it is not there, or a value in it cannot be used; one sentence.
+        ScoreError: it is not there, or a value in it cannot be used.
     """
     path = Path(os.path.expanduser(name))
     if not path.is_file():
@@ -457,8 +340,3 @@ def find_exercise_files() -> dict[str, Path]:
     return {
         f.stem: f for root in shared_roots() for f in (root / "config/exercises").glob("*.yaml")
     }
-
-
-def _is_centred(section: VesselSection, offset: float) -> NDArray[np.bool_]:
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.abs(section.lateral) <= offset)

@@ -1,7 +1,7 @@
 """A scan that is scored while it is done, at a cost that does not grow with it.
 
-Samples that later ones cannot change any more are added to the score once and for all; only those
-of the last seconds are added anew each time, to a copy.
+Samples that later ones cannot change any more are added to the tally and the attempt once; only
+those of the last seconds are added anew each time, to a copy.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _LATE = 2.0
 
 
 class Score(NamedTuple):
-    """What is told of a scan."""
+    """The metrics of a scan, and the progress of an attempt."""
 
     metrics: list[Metric]
     steps: Sequence[Step] = ()
@@ -43,9 +43,9 @@ class LiveScan:
     """A scan that grows while it is done, its metrics, and the steps of an exercise.
 
     Args:
-        volume: whose vessels are measured, where it has labels.
+        volume: its vessels are measured, if it has labels.
         scanner: of that volume at rest, with the probe that scans.
-        exercise: that is followed.
+        exercise: that the learner does.
         limits: of the metrics.
 
     Raises:
@@ -60,7 +60,8 @@ class LiveScan:
         limits: ScoreSettings | None = None,
     ) -> None:
         self.lines, self._thrombi = find_vessels(volume)
-        self._lumens = find_lumen_labels(volume.label_names) if self.lines else {}
+        labels = find_lumen_labels(volume.label_names)
+        self._lumens = {name: labels[name] for name in self.lines}
         self._scanner, self._exercise, self._limits = scanner, exercise, limits
         self.clear()
 
@@ -78,27 +79,27 @@ class LiveScan:
         )
 
     def add_pose(self, time: float, pose: Pose) -> None:
-        """Take a pose of the probe at a time (s) after those before; others are passed over."""
+        """Add a pose of the probe at a time (s); one that is not after those before is ignored."""
         if self._is_next(self._pose_times, time):
             self._pose_times.append(time)
             self._poses.append(pose)
 
     def add_force(self, time: float, force: NDArray[np.float64]) -> None:
-        """Take the force (3,) N on the probe, likewise."""
+        """Add the force (3,) N on the probe, as `add_pose` a pose."""
         if self._is_next(self._force_times, time):
             self._force_times.append(time)
             self._newtons.append(float(np.linalg.norm(force)))
 
     def add_labels(self, time: float, pose: Pose, labels: NDArray[np.uint8]) -> None:
-        """Take the labels (rows, columns) of an image, likewise."""
+        """Add the labels (rows, columns) of an image, as `add_pose` a pose."""
         if self._lumens and self._is_next(self._meter.times, time):
             self._meter.add_image(time, pose, labels)
 
     def set_answers(self, points: Sequence[str], thrombus: str) -> None:
-        """Take the learner's answers so far, see `Attempt.set_answers`.
+        """Set the learner's answers so far, see `Attempt.set_answers`.
 
         Raises:
-            ScoreError: nothing is asked, or an answer will not do.
+            ScoreError: nothing is asked, the attempt has ended, or an answer will not do.
         """
         if self._attempt is None:
             raise ScoreError("answers: no exercise is followed")
@@ -110,13 +111,16 @@ class LiveScan:
         return time > self._settled and not (times and time <= times[-1])
 
     def build_scan(self, since: float = -np.inf, until: float = np.inf) -> Scan | None:
-        """All so far, or a piece; None before there is a motion, or while a force is alone.
+        """Return the scan so far, or a piece of it.
 
         Args:
             since: s, end of the piece before.
             until: s, end of this piece.
+
+        Returns:
+            None before there is a motion, or where the piece has one force and no other before it.
         """
-        begin, end = _span(self._pose_times, since, until, 3)
+        begin, end = _span(self._pose_times, since, until)
         if end - begin < 2:
             return None
         poses = self._poses[begin:end]
@@ -125,16 +129,15 @@ class LiveScan:
             np.array([pose.position for pose in poses]),
             np.array([pose.orientation for pose in poses]),
         )
-        begin, end = _span(self._force_times, since, until, 1)
+        begin, end = _span(self._force_times, since, until)
         force = None
         if end - begin > 1:
             times = np.array(self._force_times[begin:end])
             force = Force(times, np.array(self._newtons[begin:end]))
         elif end > begin and self._force_times[begin] > since and until < np.inf:
             return None
-        width = self._scanner.probe.width
-        sections = self._meter.collect_sections(*_span(self._meter.times, since, until, 1))
-        return Scan(motion, force, sections, self.lines, self._thrombi, width, since=since)
+        sections = self._meter.collect_sections(*_span(self._meter.times, since, until))
+        return Scan(motion, force, sections, self.lines, self._thrombi, since=since)
 
     def compute_score(self) -> Score | None:
         """Return the score so far; None before there is a motion."""
@@ -153,17 +156,17 @@ class LiveScan:
 
     def _settle(self) -> None:
         """Add what later samples cannot change any more."""
-        until = self._end()
+        until = self._find_end()
         piece = self.build_scan(self._settled, until) if until > self._settled else None
         if piece is not None:
             _add(self._tally, self._attempt, piece)
             self._settled = until
 
-    def _end(self) -> float:
-        """The last time (s) after which a piece may begin.
+    def _find_end(self) -> float:
+        """Return the last time (s) after which a piece may begin.
 
         It is a force's, so that the force at a pose lies between two of one piece; and the image
-        before it says of every vessel whether it is in view.
+        before it shows of every vessel that it is in view or not.
         """
         if not self._pose_times:
             return self._settled
@@ -181,9 +184,9 @@ class LiveScan:
         return self._settled
 
 
-def _span(times: list[float], since: float, until: float, before: int) -> tuple[int, int]:
-    """The samples of a piece, with so many before it: from an index to another."""
-    return max(bisect_right(times, since) - before, 0), bisect_right(times, until)
+def _span(times: list[float], since: float, until: float) -> tuple[int, int]:
+    """Return the slice of a piece's samples, from the last sample before it on."""
+    return max(bisect_right(times, since) - 1, 0), bisect_right(times, until)
 
 
 def _add(tally: Tally, attempt: Attempt | None, scan: Scan) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,7 @@ def lift_probe(pose: Pose) -> Pose:
 
 
 def find_lumen_labels(label_names: Mapping[int, str]) -> dict[str, tuple[int, ...]]:
-    """Labels of the inside of each vessel, veins first; a ``vein thrombus`` fills part of ``vein``.
+    """Return the labels inside each vessel, veins first; ``vein thrombus`` fills part of ``vein``.
 
     >>> find_lumen_labels({5: "artery", 6: "vein", 8: "vein thrombus"})
     {'vein': (6, 8), 'artery': (5,)}
@@ -47,9 +46,9 @@ def find_lumen_labels(label_names: Mapping[int, str]) -> dict[str, tuple[int, ..
 
 
 def find_vessels(volume: Volume) -> tuple[dict[str, CentreLine], dict[str, tuple[float, float]]]:
-    """Centre lines of vessels by their names, and where along them a thrombus is (m, from, to).
+    """Return the vessels' centre lines, and the places (from, to) m of thrombi along them.
 
-    A vessel that is not long has none.
+    Both are by the vessels' names. A short vessel has neither.
     """
     lines: dict[str, CentreLine] = {}
     thrombi: dict[str, tuple[float, float]] = {}
@@ -67,39 +66,19 @@ def find_vessels(volume: Volume) -> tuple[dict[str, CentreLine], dict[str, tuple
     return lines, thrombi
 
 
-@dataclass(frozen=True)
-class LumenAreas:
-    """Cross-sections of vessels in the image plane."""
-
-    time: NDArray[np.float64]  # (K,) s since the first pose
-    depth: NDArray[np.float64]  # (K,) m, how deep the probe is pressed below the skin
-    area: dict[str, NDArray[np.float64]]  # (K,) m² by vessel
-    # (K,) m² by vessel, in the same planes of the tissue at rest; NaN where it is hardly cut
-    at_rest: dict[str, NDArray[np.float64]]
-
-    @property
-    def pressed(self) -> int:
-        """The first sample within 1 % of the deepest press."""
-        return int(np.argmax(self.depth >= 0.99 * self.depth.max()))
-
-    def compute_fraction(self, vessel: str) -> NDArray[np.float64]:
-        """(K,) area over that of the same plane at rest; NaN where there is nothing to compare."""
-        return np.asarray(self.area[vessel] / self.at_rest[vessel])
-
-
 class LumenMeter:
     """Measures vessels image by image.
 
     Where the probe slides or tilts it sees other cross-sections, so each is compared with that of
-    the same plane at rest, from the skin on. A vessel that no image cuts has none; of one that
-    reaches the image's edge, now or at rest, nobody knows how large it is, nor of one that vanishes
-    from the image just before or after.
+    the same plane at rest, from the skin on. An area at rest is NaN where no one can compare: a
+    vessel is hardly cut, reaches the image's edge, now or at rest, or vanishes from the image just
+    before or after it does so.
 
     Args:
         lumens: labels of each vessel by its name.
         scanner: that finds labels.
         rest: (N, 3) m, nodes of the mesh that the scanner carries; None where it carries none.
-        lines: centre lines by the vessels' names, for `collect_sections`.
+        lines: centre lines by the vessels' names.
     """
 
     def __init__(
@@ -110,52 +89,53 @@ class LumenMeter:
         lines: Mapping[str, CentreLine] | None = None,
     ) -> None:
         self._lumens, self._scanner, self._rest = lumens, scanner, rest
-        self._lines = lines or {}
-        typical = [self._lines[name].area if name in self._lines else 0.0 for name in lumens]
+        self._lines = {name: (lines or {}).get(name) for name in lumens}
+        typical = [0.0 if line is None else line.area for line in self._lines.values()]
         self._typical = np.array(typical).reshape(-1, 1)  # m²
         self._pixel = float(np.prod(scanner.probe.pixel_spacing))
-        self._edge = _edge(scanner.probe)
+        self._edge = _find_edge(scanner.probe)
         self.times: list[float] = []  # s, of all samples
-        self._depth: list[float] = []
-        self._cuts: dict[str, list[tuple[float, ...]]] = {name: [] for name in self._lines}
-        self._found: list[list[list[float]]] = []  # m², now and at rest, by vessel
-        self._whole: list[NDArray[np.bool_]] = []  # in the image, by vessel
+        self._depths: list[float] = []  # m, of the probe below the skin
+        self._cuts: list[list[tuple[float, float]]] = []  # m along and lateral, by vessel
+        self._areas: list[list[list[float]]] = []  # m², now and at rest, by vessel
+        self._is_whole: list[NDArray[np.bool_]] = []  # in the image, by vessel
 
     def add_image(self, time: float, pose: Pose, labels: NDArray[np.uint8]) -> None:
         """Measure an image, of the labels (rows, columns) that it shows."""
-        above = lift_probe(pose)
+        above, width = lift_probe(pose), self._scanner.probe.width
         seen = labels, self._scanner.render_labels(above, self._rest)
         inside = [[np.isin(each, n) for n in self._lumens.values()] for each in seen]
+        cuts = [line and line.find_cut(above, width) for line in self._lines.values()]
         self.times.append(time)
-        self._depth.append(float(pose.position[2]))
-        for name, line in self._lines.items():
-            cut = line.find_cut(above, self._scanner.probe.width)
-            place = (cut.along, cut.angle, cut.lateral) if cut else (np.nan,) * 3
-            self._cuts[name].append(place)
-        self._found.append([[self._pixel * float(v.sum()) for v in each] for each in inside])
-        self._whole.append(~np.any([[v[self._edge].any() for v in each] for each in inside], 0))
+        self._depths.append(float(pose.position[2]))
+        self._cuts.append([(cut.along, cut.lateral) if cut else (np.nan, np.nan) for cut in cuts])
+        self._areas.append([[self._pixel * float(v.sum()) for v in each] for each in inside])
+        self._is_whole.append(~np.any([[v[self._edge].any() for v in each] for each in inside], 0))
 
-    def collect_areas(self) -> LumenAreas | None:
-        """All that were measured; None where no vessel was cut that can be compared."""
-        if not self.times:
-            return None
-        now, rest = self._compared()
-        cut = {n: i for i, n in enumerate(self._lumens) if np.isfinite(rest[i]).any()}
-        if not cut:
-            return None
-        return LumenAreas(
-            time=np.array(self.times),
-            depth=np.array(self._depth),
-            area={name: now[i] for name, i in cut.items()},
-            at_rest={name: rest[i] for name, i in cut.items()},
-        )
+    def collect_comparable_sections(self) -> dict[str, VesselSection]:
+        """Return the sections of the vessels of which an image can be compared with rest."""
+        sections = self.collect_sections()
+        return {n: each for n, each in sections.items() if np.isfinite(each.at_rest).any()}
 
-    def _compared(
-        self, begin: int = 0, end: int | None = None
+    def collect_sections(self, begin: int = 0, end: int | None = None) -> dict[str, VesselSection]:
+        """Return the sections of these samples by the vessels' names; none without a sample."""
+        times = np.array(self.times[begin:end])
+        if not len(times):
+            return {}
+        now, rest = self._compare_areas(begin, end)
+        cuts = np.array(self._cuts[begin:end]).transpose(1, 2, 0)
+        depths = np.array(self._depths[begin:end])
+        return {
+            name: VesselSection(times, now[k], rest[k], *cuts[k], depths)
+            for k, name in enumerate(self._lumens)
+        }
+
+    def _compare_areas(
+        self, begin: int, end: int | None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Areas (V, K) m² of these samples, and those at rest, NaN where nobody knows them."""
-        now, rest = np.array(self._found[begin:end]).transpose(1, 2, 0)
-        whole, count = np.array(self._whole[begin:end]).T.copy(), now.shape[1]
+        """Return areas (V, K) m² of these samples now, and at rest, NaN where none is known."""
+        now, rest = np.array(self._areas[begin:end]).transpose(1, 2, 0)
+        whole, count = np.array(self._is_whole[begin:end]).T.copy(), now.shape[1]
         is_gone = (now == 0.0) & (rest > 0.0)  # pushed out, maybe not closed
         for k in [*range(1, count), *range(count - 2, -1, -1)]:
             for beside in {max(k - 1, 0), min(k + 1, count - 1)}:
@@ -164,23 +144,12 @@ class LumenMeter:
         return now, np.where((rest <= _HARDLY_CUT * typical) | ~whole, np.nan, rest)
 
     def is_settled(self, sample: int) -> bool:
-        """Whether later samples change nothing of this one and those before."""
-        now, rest = self._found[sample]
+        """Return whether later samples change nothing of this one and those before."""
+        now, rest = self._areas[sample]
         return not any(n == 0.0 and r > 0.0 for n, r in zip(now, rest, strict=True))
 
-    def collect_sections(self, begin: int = 0, end: int | None = None) -> dict[str, VesselSection]:
-        """Areas and places of the vessels that have a centre line, of these samples."""
-        times = np.array(self.times[begin:end])
-        if not len(times):
-            return {}
-        areas = dict(zip(self._lumens, zip(*self._compared(begin, end), strict=True), strict=True))
-        return {
-            name: VesselSection(times, *areas[name], *np.array(cuts[begin:end]).T)
-            for name, cuts in self._cuts.items()
-        }
 
-
-def _edge(probe: Probe) -> NDArray[np.bool_]:
-    """(rows, columns) the last pixels of an image that its beams reach."""
+def _find_edge(probe: Probe) -> NDArray[np.bool_]:
+    """Mark the last pixels (rows, columns) of an image that its beams reach."""
     reached = np.pad(np.isfinite(probe.pixel_beams[0]), 1)
     return np.asarray((reached & ~binary_erosion(reached))[1:-1, 1:-1])

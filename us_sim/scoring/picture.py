@@ -19,7 +19,10 @@ _MM = 1e3
 
 
 def draw_score(file: Path | IO[bytes], title: str, scan: Scan, steps: Sequence[Step] = ()) -> None:
-    """Write a PNG: the way over the skin at the left; force and areas over time at the right."""
+    """Write a PNG of the way over the skin, and of force and areas over time.
+
+    A scan with neither has the speed over time.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -2,7 +2,7 @@
 
 The document has `name`, `description`, `scene`, `state` (of `STATES`), `seconds`, and
 
-- `about`: who did what, when, with what, by words,
+- `about`: student, begin, exercise, scene and settings, texts by word,
 - `plain`: the five metrics that are read first, texts by label,
 - `steps` (`what`, `state`, `seen`, `target`, `pose`) and `faults` (`seconds`, `what`),
 - `metrics`: all others, texts by label.
@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 
 from us_sim.scoring.live import Score
-from us_sim.scoring.metrics import DEFINITIONS, Metric
+from us_sim.scoring.metrics import Metric
 from us_sim.scoring.settings import STATES
 
 MARKS = {"done": "✓", "missed": "✗", "to do": "○"}
-"""Of steps, by their states."""
+"""Marks of steps, by their states."""
 _STYLE = (
     "body {font-family: sans-serif; max-width: 70em; margin: 2em auto; padding: 0 1em} "
     "td {padding: 0.15em 1em 0.15em 0; vertical-align: top} img {width: 100%} "
@@ -32,7 +32,7 @@ _ALT = "The probe's way over the skin, with the force; force and areas of vessel
 
 
 def select_plain_metrics(score: Score, force_limit: float) -> list[Metric]:
-    """Return the five that are read first: time, force, time over its limit, way, points."""
+    """Return the five that are read first: time, force, time above its limit, way, points."""
     known = {each.name: each.value for each in score.metrics}
     over = f"Time above {force_limit:g} N"
     done = sum(step.is_done for step in score.steps)
@@ -47,7 +47,7 @@ def select_plain_metrics(score: Score, force_limit: float) -> list[Metric]:
 
 
 def classify_attempt(score: Score, void: str = "") -> str:
-    """Return what became of an attempt, one of `STATES`."""
+    """Return the state of an attempt, one of `STATES`; ``void`` says why it does not count."""
     if void:
         return "void"
     if score.seconds is None:
@@ -67,7 +67,6 @@ def render_page(result: Mapping[str, Any], picture: bytes = b"") -> str:
     title = escape(result["name"])
     steps = [(MARKS[s["state"]], s["what"], s["seen"]) for s in result["steps"]]
     faults = [(f"{each['seconds']} s", each["what"]) for each in result["faults"]]
-    more = [(label, text, _definition_of(label)) for label, text in result["metrics"].items()]
     shown = f'<img src="{encode_picture(picture)}" alt="{_ALT}">' if picture else ""
     return (
         f'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
@@ -77,18 +76,13 @@ def render_page(result: Mapping[str, Any], picture: bytes = b"") -> str:
         f"{_table(result['plain'].items(), 'plain')}{_table(steps)}"
         f"{'<h2>Faults</h2>' if faults else ''}{_table(faults, 'fault')}{shown}"
         f"<h2>About</h2>{_table(result['about'].items())}"
-        f"<details><summary>More</summary>{_table(more)}</details></html>"
+        f"<details><summary>More</summary>{_table(result['metrics'].items())}</details></html>"
     )
 
 
 def encode_picture(picture: bytes) -> str:
-    """Return a PNG as an address that holds it."""
+    """Return a PNG as a data URL."""
     return f"data:image/png;base64,{base64.b64encode(picture).decode()}"
-
-
-def _definition_of(label: str) -> str:
-    """Return the definition of the metric whose name a label begins with; "" where it has none."""
-    return next((text for name, text in DEFINITIONS.items() if label.startswith(name)), "")
 
 
 def _table(rows: Iterable[Sequence[str]], kind: str = "") -> str:

@@ -1,4 +1,4 @@
-"""Where results of attempts are written and read: a folder, or an address of fsspec."""
+"""The place where results of attempts are written and read: a folder, or an address of fsspec."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ KEPT_FOLDER = "us_sim_results"
 
 
 class ResultPlace:
-    """A place that results are written to, with those that it has not taken yet.
+    """A place that results are written to, with those that it has refused so far.
 
     Args:
         address: a folder, or one of fsspec.
@@ -42,7 +42,7 @@ class ResultPlace:
                 Path(file).unlink()
 
     def write(self, result: Mapping[str, Any], picture: bytes) -> list[str]:
-        """Write the page and the document, under a name of who, what and when.
+        """Write the page and the document, named by student, exercise and begin.
 
         Args:
             result: the document.
@@ -52,7 +52,7 @@ class ResultPlace:
             The two files' addresses.
 
         Raises:
-            ScoreError: they cannot be written; the sentence names the file that has them meanwhile.
+            ScoreError: they cannot be written; it names the file on this machine that keeps them.
         """
         from us_sim.scoring.result import render_page  # it brings scipy, which only this takes
 
@@ -69,10 +69,10 @@ class ResultPlace:
             raise _refusal(error, kept) from error
 
     def write_kept(self) -> list[str]:
-        """Write what the place has not taken yet, and remove it here; return its new addresses.
+        """Write the results that are kept, remove them here, and return their new addresses.
 
         Raises:
-            ScoreError: it cannot be written still; the sentence names the first file.
+            ScoreError: they still cannot be written; it names the first file.
         """
         written: list[str] = []
         while self._kept:

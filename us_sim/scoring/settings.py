@@ -1,4 +1,4 @@
-"""Limits of a score, and words for it: what is read without SciPy."""
+"""Limits of a score, and words for it: read without SciPy."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ STATES = {
     "not passed": "not passed",
     "void": "void",
 }
-"""Words for what became of an attempt."""
+"""Words for the states of an attempt."""
 ANSWERS = ("compressible", "not compressible", "not seen")
-"""Of a learner, on a point of a vein."""
+"""A learner's answers on a point of a vein."""
 NO_ANSWER = "-"
-"""Likewise, where there is none yet."""
+"""Stands for an answer that is not given yet."""
 NO_THROMBUS = "none"
-"""Of a learner, on where it is."""
+"""A learner's answer where there is no thrombus."""
 
 
 @dataclass(frozen=True)

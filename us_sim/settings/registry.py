@@ -111,8 +111,6 @@ EXERCISES = Choice(
     compression="us_sim.scoring.compression:Compression",
     keep_force=f"{_EXERCISES}:KeepForce",
     centre=f"{_EXERCISES}:Centre",
-    follow=f"{_EXERCISES}:Follow",
-    view=f"{_EXERCISES}:View",
 )
 
 _EVALUATION = "us_sim.evaluation"

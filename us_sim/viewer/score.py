@@ -23,7 +23,6 @@ from us_sim.viewer.stream import CallPoster, Packet, Simulator
 SCORE, PICTURE = "score", "score_picture"
 """Streams: of an exercise's steps and the metrics, and of their picture as PNG."""
 _STATES = {DiagnosticStatus.OK: "done", DiagnosticStatus.ERROR: "missed"}
-_SHAPES = {"target": (-1, 3), "pose": (7,)}  # of the numbers that a step may have
 
 
 def connect_scorer(node: GuardedNode, post: CallPoster, simulator: Simulator) -> None:
@@ -107,14 +106,14 @@ def _values(status: DiagnosticStatus) -> dict[str, str]:
 def _step(status: DiagnosticStatus) -> dict[str, Any]:
     step = {"what": loggable_text(status.name), "seen": loggable_text(status.message)}
     step["state"] = _STATES.get(status.level, "to do")
-    places = {e.key: _numbers(e.value, _SHAPES[e.key]) for e in status.values if e.key in _SHAPES}
-    return step | {key: numbers for key, numbers in places.items() if numbers}
+    points = _read_points(_values(status).get("target", ""))
+    return step | ({"target": points} if points else {})
 
 
-def _numbers(text: str, shape: tuple[int, ...]) -> list[Any]:
-    """The finite numbers of a JSON list; none where it is no such list."""
+def _read_points(text: str) -> list[Any]:
+    """Read the finite points (P, 3) m of a JSON list; none where it is no such list."""
     try:
-        numbers = np.array(json.loads(text), np.float64).reshape(shape)
+        numbers = np.array(json.loads(text), np.float64).reshape(-1, 3)
     except (ValueError, TypeError, ArithmeticError, RecursionError):
         return []
     return numbers.tolist() if np.isfinite(numbers).all() else []

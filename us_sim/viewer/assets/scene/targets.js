@@ -1,5 +1,5 @@
 /**
- * Where an exercise is to be done: dots on the skin, and the plane of a view that is to be found.
+ * Where an exercise is to be done: dots on the skin.
  *
  * Dots stand on the skin above the points that are told, and move with it. Points bear the number
  * with which the text of their step begins.
@@ -28,18 +28,7 @@ const dots = new THREE.InstancedMesh(
 );
 dots.frustumCulled = false;
 dots.renderOrder = 8;
-const plane = new THREE.Mesh(
-  new THREE.BufferGeometry(),
-  new THREE.MeshBasicMaterial({
-    transparent: true,
-    opacity: 0.4,
-    side: THREE.DoubleSide,
-    depthWrite: false,
-  }),
-);
-plane.name = "wanted view";
-plane.renderOrder = 4;
-group.add(dots, plane);
+group.add(dots);
 stage.scene.add(group);
 
 let steps = []; // {step, dots: [{point, vertex, aside, radius}], number}
@@ -48,7 +37,7 @@ let boundTo; // the skin on which the dots stand
 let shown = ""; // all of it that is shown
 
 function take() {
-  const told = exercise.steps.map(({ what, state, target, pose }) => [what, state, target, pose]);
+  const told = exercise.steps.map(({ what, state, target }) => [what, state, target]);
   const text = JSON.stringify(told);
   if (text === shown) return;
   shown = text;
@@ -107,7 +96,6 @@ stage.beforeDrawing(() => {
   const { next } = exercise;
   const place = new THREE.Matrix4();
   dots.count = 0;
-  plane.visible = false;
   for (const { step, dots: those } of steps) {
     const colour = new THREE.Color(COLOURS[step === next ? "next" : step.state]);
     for (const dot of those) {
@@ -118,13 +106,6 @@ stage.beforeDrawing(() => {
       dots.setMatrixAt(dots.count, place);
       dots.setColorAt(dots.count, colour);
       dots.count += 1;
-    }
-    if (step.pose) {
-      plane.visible = true;
-      plane.geometry = probe.image.geometry;
-      plane.position.fromArray(step.pose);
-      plane.quaternion.fromArray(step.pose, 3);
-      plane.material.color = colour;
     }
   }
   dots.instanceMatrix.needsUpdate = true;
