@@ -54,7 +54,13 @@ def sphere(steps: int = 90) -> StandingSurface:
     return StandingSurface(RADIUS * grid.reshape(-1, 3), triangles)
 
 
-PLANE, CYLINDER, SPHERE = StandingSurface.create_plane(0.1), cylinder(), sphere()
+def plane(half=0.1):
+    """The square of z = 0 around the origin, with the body at z > 0."""
+    corners = half * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    return StandingSurface(corners, np.array([[0, 2, 1], [0, 3, 2]]))
+
+
+PLANE, CYLINDER, SPHERE = plane(), cylinder(), sphere()
 FACET = RADIUS * (1 - math.cos(math.radians(1)))  # how deep a facet of 2 degrees lies below
 
 

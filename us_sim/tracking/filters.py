@@ -44,7 +44,7 @@ class PoseFilter(ABC):
     @property
     @abstractmethod
     def lag(self) -> float:
-        """s by which, as the filter is set now, its position is behind a uniform motion."""
+        """Time (s) by which the position, as the filter is set now, is behind a uniform motion."""
 
 
 class Unfiltered(PoseFilter):
@@ -53,14 +53,14 @@ class Unfiltered(PoseFilter):
     lag = 0.0
 
     def __init__(self, _: Settings | None = None) -> None:
-        """There is nothing to set."""
+        """Ignore the settings."""
 
     def update(self, measurement: Measurement) -> Measurement:
         """Return the measurement itself."""
         return measurement
 
     def reset(self) -> None:
-        """Nothing is kept."""
+        """Do nothing: there is no state."""
 
 
 def create_filter(name: str, settings: Settings | None = None) -> PoseFilter:
@@ -133,7 +133,7 @@ class OneEuro(PoseFilter):
 
     @property
     def lag(self) -> float:
-        """s, behind a uniform motion: the filter's time constant 1 / (2 pi fc), exactly.
+        """Time (s) behind a uniform motion: the filter's time constant 1 / (2 pi fc), exactly.
 
         Exponential smoothing with the factor a and the step T is T (1 - a) / a behind a ramp; with
         the factor of Casiez et al. (eq. 5) that is the time constant, whatever the step is.
@@ -250,7 +250,7 @@ class ConstantVelocityKalman(PoseFilter):
 
     @property
     def lag(self) -> float:
-        """s, none: once it knows the velocity the filter is not behind a uniform motion.
+        """0 s: once it knows the velocity the filter is not behind a uniform motion.
 
         It settles as an alpha-beta tracker, whose error for a ramp is zero (Kalata 1984).
         """

@@ -7,8 +7,8 @@ the wrench:
 >>> wrench = np.array([0.0, 0.0, -2.0, 0.0, 0.0, 0.0])  # N: pressed 10 mm into 200 N/m
 >>> stiffness = np.diag([0.0, 0.0, 200.0, 0.0, 0.0, 0.0])
 >>> wall = ContactModel(0, Pose(position=[0.0, 0.0, 0.01]), wrench, stiffness)
->>> deeper = [wall.compute_wrench(np.array([0.0, 0.0, z, 0.0, 0.0, 0.0])) for z in (0.005, -0.005, -0.015)]
->>> [round(float(wrench[2]), 6) + 0.0 for _, wrench in deeper]
+>>> moved = [np.array([0.0, 0.0, z, 0.0, 0.0, 0.0]) for z in (0.005, -0.005, -0.015)]
+>>> [round(float(wall.compute_wrench(each)[1][2]), 6) + 0.0 for each in moved]
 [-3.0, -1.0, 0.0]
 """
 
@@ -35,7 +35,7 @@ _FARTHEST = 0.03  # m: distance after which the push ends at the latest, however
 
 
 def rotate_to_patient(pose: Pose, force: Array, torque: Array) -> Array:
-    """(6,) N, N m: force and torque (3,) along the probe's axes, along those of ``patient``."""
+    """Turn force and torque (3,) from the probe's axes to those of ``patient``: (6,) N, N m."""
     return np.concatenate([pose.rotation @ force, pose.rotation @ torque])
 
 
@@ -62,8 +62,7 @@ class ContactModel:
 
     @cached_property
     def _split(self) -> tuple[Array, float, Array, Array, Array]:
-        """The push's direction (3,), N, and how it falls (6,); the rest's wrench (6,) and stiffness
-        (6, 6)."""
+        """The push's direction (3,), N and slope (6,); the rest's wrench (6,), stiffness (6, 6)."""
         force = float(np.linalg.norm(self.wrench[:3]))
         if force == 0.0:
             return np.zeros(3), 0.0, np.zeros(6), np.zeros(6), np.zeros((6, 6))
@@ -77,7 +76,7 @@ class ContactModel:
         return direction, force, slope, self.wrench - force * shape, rest
 
     def compute_wrench(self, displacement: Array) -> tuple[float, Array]:
-        """The energy (J) and the wrench (6,) N, N m at a displacement (6,) m, rad."""
+        """Return the energy (J) and the wrench (6,) N, N m at a displacement (6,) m, rad."""
         energy, wrench = self._slope(displacement)
         turn = displacement[3:]
         if wrench[3:].any() and turn.any():
@@ -86,7 +85,7 @@ class ContactModel:
         return energy, wrench
 
     def _slope(self, d: Array) -> tuple[float, Array]:
-        """The energy (J) at a displacement (6,), and how it falls with that (6,)."""
+        """Return the energy (J) at a displacement (6,), and its negative slope (6,)."""
         direction, force, slope, wrench, stiffness = self._split
         if force == 0.0:
             return 0.0, np.zeros(6)
@@ -137,7 +136,8 @@ class HapticRendering:
 
     After any doubt the wrench is zero, until a model comes that is newer, and then grows slowly.
 
-    `update_pose`, `update_model`, `set_clutch` and `stop_rendering` may be called while another thread renders.
+    `update_pose`, `update_model`, `set_clutch` and `stop_rendering` may be called while another
+    thread renders.
 
     Args:
         settings: limits and times.
@@ -180,15 +180,15 @@ class HapticRendering:
         return self._handle.stamps[-1] if self._handle.stamps else None
 
     def update_pose(self, stamp: int, pose: Pose, now: int) -> None:
-        """Take a pose of the handle in the arm's frame; stamp and time of arrival in ns."""
+        """Set the pose of the handle in the arm's frame; stamp and time of arrival in ns."""
         self._arrived.append((stamp, pose, now))
 
     def update_model(self, model: ContactModel, now: int) -> None:
-        """Take a model of the contact; time of arrival in ns."""
+        """Set the model of the contact; time of arrival in ns."""
         self._arrived_model.append((model, now))
 
     def set_clutch(self, held: bool) -> None:
-        """Take the state of the clutch: while it is held nothing is felt."""
+        """Set the state of the clutch: while it is held nothing is felt."""
         self._is_clutched = held
 
     def stop_rendering(self, why: str) -> None:
@@ -196,9 +196,10 @@ class HapticRendering:
         self._distrusted.append(why)
 
     def render(self, now: int) -> Array:
-        """(6,) N, N m on the handle until the next tick, about its origin, axes of the arm.
+        """Return the wrench (6,) N, N m on the handle until the next tick.
 
-        ``now`` is in ns of the clock of `update_pose` and `update_model`.
+        It is about the handle's origin, along the axes of the arm. ``now`` is in ns of the clock of
+        `update_pose` and `update_model`.
         """
         doubt = self._take_poses(now)
         self.energy -= float(self._felt @ self._motion)
@@ -241,7 +242,7 @@ class HapticRendering:
         return self._felt.copy()
 
     def _take_poses(self, now: int) -> str:
-        """Take the poses that arrived; returns a doubt about the handle, or an empty text."""
+        """Use the poses that arrived; return a doubt about the handle, or ""."""
         doubt = self._distrusted.popleft() if self._distrusted else ""
         self._motion = np.zeros(6)
         while self._arrived:
@@ -272,7 +273,7 @@ class HapticRendering:
         return "the clutch is held" if self._is_clutched else ""
 
     def _adopt(self, model: ContactModel, time: int) -> None:
-        """Change to a newer model, if it is known where the handle was."""
+        """Change to a newer model, if the handle's pose at its stamp is known."""
         stamp = model.stamp - self._time_offset
         if self._not_before is not None and stamp <= self._not_before:
             return
@@ -309,12 +310,12 @@ class HapticRendering:
         return np.zeros(6)
 
     def _left(self, now: int) -> Array:
-        """(6,) N, N m, the remainder of earlier models."""
+        """Return the remainder (6,) N, N m of earlier models."""
         fraction = 1.0 - 1e-9 * (now - self._since) / self._settings.hand_over
         return self._left_over * min(max(fraction, 0.0), 1.0)
 
     def _unilateral(self, felt: Array) -> Array:
-        """The wrench, less a force that would pull the handle against the tissue's push."""
+        """Return the wrench, less a force that would pull the handle against the tissue's push."""
         assert self._model is not None
         push = self._device.rotate_to_handle(self._model.push)
         pulled = float(felt[:3] @ push)
@@ -323,7 +324,7 @@ class HapticRendering:
         return felt
 
     def _limited(self, felt: Array) -> Array:
-        """The wrench within the limits of the arm."""
+        """Return the wrench within the limits of the arm."""
         force, torque = _lengths(felt)
         if force > self._settings.force_limit:
             felt[:3] *= self._settings.force_limit / force
@@ -332,7 +333,7 @@ class HapticRendering:
         return felt
 
     def _passive(self, felt: Array) -> Array:
-        """The wrench, less the part along the motion that would return too much energy."""
+        """Return the wrench, less the part along the motion that would return too much energy."""
         motion = sum(self._motions) / len(self._motions)
         work = float(felt @ motion)
         left = self.energy
@@ -350,13 +351,13 @@ class HapticRendering:
 
 
 def _motion(first: Pose, second: Pose) -> Array:
-    """(6,) m, rad, from one pose of the handle to another, along the axes of the arm."""
+    """Return the motion (6,) m, rad between two poses of the handle, along the axes of the arm."""
     turn = se3.rotation_between(first.orientation, second.orientation)
     return np.concatenate([second.position - first.position, turn])
 
 
 def _lengths(pair: Array) -> tuple[float, float]:
-    """The norms of the first and of the last three numbers."""
+    """Return the norms of the first and of the last three numbers."""
     a, b, c, d, e, f = pair.tolist()
     return math.sqrt(a * a + b * b + c * c), math.sqrt(d * d + e * e + f * f)
 
@@ -393,10 +394,11 @@ class HapticDevice:
         self.is_held = False
 
     def measure_body(self, pose: Pose, stamp: int) -> Measurement:
-        """The body that carries the probe, from the handle's pose at a stamp, in the arm's frame.
+        """Measure the body that carries the probe, from the handle's pose, in the arm's frame.
 
         Args:
             stamp: ns.
+            pose: of the handle in the arm's frame.
         """
         self._last = pose
         body = self._held or self._body(pose)
@@ -420,28 +422,29 @@ class HapticDevice:
         return Pose(self._scale * pose.position + self._offset, turned)
 
     def compute_probe_motion(self, probe: Pose, before: Pose, now: Pose) -> Array:
-        """How the probe moves with the handle, whatever the clutch did earlier.
+        """Return the probe's motion with the handle's, whatever the clutch did earlier.
 
         Args:
             probe: in ``patient``, when the handle was at ``before``.
-            before, now: of the handle in the arm's frame.
+            before: of the handle in the arm's frame.
+            now: of the handle in the arm's frame.
 
         Returns:
-            (6,) m, rad: displacement of its origin, and its rotation vector, axes of ``patient``.
+            (6,) m, rad: displacement of its origin, and rotation vector, axes of ``patient``.
         """
         moved = np.empty(6)
         moved[:3] = self._turn @ (self._scale * (now.position - before.position))
         moved[3:] = self._turn @ se3.rotation_between(before.orientation, now.orientation)
         if self._lever.any():
             arm = probe.rotation @ self._lever
-            moved[:3] += _turned(arm, moved[3:]) - arm
+            moved[:3] += _rotate(arm, moved[3:]) - arm
         return moved
 
     def compute_handle_wrench(self, probe: Pose, turn: Array, wrench: Array) -> Array:
-        """(6,) N, N m on the handle, about its origin along the axes of the arm.
+        """Return the wrench (6,) N, N m on the handle, about its origin along the axes of the arm.
 
-        Its work is that of the wrench on the probe times `work_ratio`: what takes no energy there
-        takes none here.
+        Its work is that of the wrench on the probe times `work_ratio`, so a motion that takes no
+        energy there takes none here.
 
         Args:
             probe: in ``patient``, before it has turned.
@@ -450,7 +453,7 @@ class HapticDevice:
         """
         force, torque = wrench[:3], wrench[3:]
         if self._lever.any():
-            arm = _turned(probe.rotation @ self._lever, turn)
+            arm = _rotate(probe.rotation @ self._lever, turn)
             torque = torque + se3.cross_matrix(arm) @ force
         felt = np.empty(6)
         felt[:3] = self._force_scale * (force @ self._turn)
@@ -458,10 +461,10 @@ class HapticDevice:
         return felt
 
     def rotate_to_handle(self, direction: Array) -> Array:
-        """(3,) along the axes of the arm, of (3,) along those of ``patient``."""
+        """Turn a direction (3,) from the axes of ``patient`` to those of the arm."""
         return direction @ self._turn
 
 
-def _turned(vector: Array, turn: Array) -> Array:
-    """A vector (3,), turned by a rotation vector (3,) rad."""
+def _rotate(vector: Array, turn: Array) -> Array:
+    """Turn a vector (3,) by a rotation vector (3,) rad."""
     return Pose(orientation=se3.rotation_exp(turn)).rotation @ vector

@@ -22,7 +22,7 @@ PATIENT = "patient"  # the frame of the tissue, and of the probe's poses
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """A body's pose in the device's frame, and how well it is known.
+    """A body's pose in the device's frame, with its covariance.
 
     The covariance is that of ROS's PoseWithCovariance: x, y, z (m), then rotations (rad) about
     the axes of the device's frame; so the rotation is exp(rotation) times the pose's.
@@ -55,14 +55,14 @@ class Measurement:
 
     @property
     def position_deviation(self) -> float | None:
-        """m, root of the summed variances of the position; None where nothing is known."""
+        """Root (m) of the summed variances of the position; None where nothing is known."""
         if self.covariance is None:
             return None
         return float(np.sqrt(np.trace(self.covariance[:3, :3])))
 
 
 class TrackingState(Enum):
-    """How far the probe's place is known."""
+    """State of tracking, by the age of the last pose."""
 
     WAITING = "waiting"  # no pose yet
     TRACKED = "tracked"

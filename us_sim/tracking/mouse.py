@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
 from us_sim.geometry import se3
-from us_sim.geometry.pose import Pose, multiply_quaternions
+from us_sim.geometry.pose import Pose
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.settings import SixDofMouseSettings
 
@@ -79,7 +79,7 @@ class SixDofMouse:
             self.pose = self._home
         elif not clutch:
             # The velocity goes evenly from the last message's to this one's.
-            pose = self._moved(self.pose, 0.5 * step * (before + self._twist))
+            pose = self.pose @ se3.exp(0.5 * step * (before + self._twist))
             low, high = self._settings.workspace_low, self._settings.workspace_high
             self.pose = Pose(np.clip(pose.position, low, high), pose.orientation)
         return Measurement(stamp, self.pose)
@@ -113,14 +113,6 @@ class SixDofMouse:
             self._held[button] = bool(buttons[button])
         return self._held.get(button, False)
 
-    def _moved(self, pose: Pose, twist: NDArray[np.float64]) -> Pose:
-        """Move a pose by (6,) m, rad, uniformly in the frame of motion."""
-        if self._settings.frame == "probe":
-            return pose @ se3.exp(twist)
-        # Along the patient's axes, and turned about the probe's face.
-        turn = multiply_quaternions(se3.rotation_exp(twist[3:]), pose.orientation)
-        return Pose(pose.position + twist[:3], turn)
-
 
 FULL_DEFLECTION = 350.0  # the largest number that the device reports
 
@@ -144,7 +136,7 @@ class SpaceMouseReports:
         self.buttons = [0, 0]
 
     def parse_report(self, report: bytes) -> bool:
-        """Take a report; returns whether it is about axes or buttons.
+        """Parse a report; return whether it is about axes or buttons.
 
         Older devices send translation and rotation one after the other, newer ones together.
         """
@@ -203,7 +195,7 @@ class SpaceMouse(SpaceMouseReports):
             ) from error
 
     def wait_for_report(self, seconds: float) -> bool:
-        """Take the next report, if one comes in time; whether something has changed.
+        """Wait for the next report; return whether one came and changed something.
 
         Raises:
             TrackingError: the device is gone.
@@ -215,7 +207,7 @@ class SpaceMouse(SpaceMouseReports):
         return self.parse_report(bytes(report))
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Close the device."""
         self._device.close()
 
 

@@ -2,7 +2,7 @@
 
 Messages are those of openigtlink.org, versions 1 to 3: big-endian and in millimetres. A message
 whose checksum is wrong is refused; senders that make none write 0. The package pyigtl knows neither
-TDATA, POSITION nor metadata, checks no checksum of what it receives, and takes a process' signals.
+TDATA nor metadata, checks no checksum of what it receives, and takes a process' signals.
 
 >>> from us_sim.tracking.openigtlink import HEADER, parse_header, parse_poses, pack_transform
 >>> matrix = np.eye(4)
@@ -41,7 +41,7 @@ HEADER = struct.Struct(">H12s20sIIQQ")
 
 NAME_LENGTH = 20  # bytes of a device's name, which is cut to that
 
-POSE_KINDS = ("TRANSFORM", "TDATA", "POSITION")
+POSE_KINDS = ("TRANSFORM", "TDATA")
 """Types of message in which there are poses."""
 
 _METRES = 1e-3
@@ -68,10 +68,10 @@ class Header:
 
 
 def parse_header(data: bytes) -> Header:
-    """The header in its 58 bytes.
+    """Parse a header from its 58 bytes.
 
     Raises:
-        TrackingError: they are none.
+        TrackingError: they are no header.
     """
     version, kind, device, seconds, fraction, size, checksum = HEADER.unpack(data)
     try:
@@ -85,10 +85,9 @@ def parse_header(data: bytes) -> Header:
 
 
 def parse_poses(header: Header, body: bytes) -> list[tuple[str, NDArray[np.float64]]]:
-    """Names and matrices (4, 4) m of the bodies in a message of one of `POSE_KINDS`.
+    """Parse names and matrices (4, 4) m of the bodies in a message of one of `POSE_KINDS`.
 
-    The matrices are as they were sent: maybe not rigid, or not finite. A POSITION may be without
-    orientation, and then is not turned, or have three of the quaternion's numbers.
+    The matrices are as they were sent: maybe not rigid, or not finite.
 
     Raises:
         TrackingError: the body is damaged, cut or of another layout, or the sender says that the
@@ -98,7 +97,7 @@ def parse_poses(header: Header, body: bytes) -> list[tuple[str, NDArray[np.float
         raise TrackingError(f"the checksum of a {header.kind} of {header.device!r} is wrong")
     content = body
     if header.version > 1:
-        content, metadata = _without_extension(header, body)
+        content, metadata = _strip_extension(header, body)
         status = metadata.get("TransformStatus", "OK")  # of Plus
         if status.upper() != "OK":
             raise TrackingError(f"the server says that {header.device} is {status}")
@@ -106,35 +105,33 @@ def parse_poses(header: Header, body: bytes) -> list[tuple[str, NDArray[np.float
         if len(content) % _ELEMENT.itemsize:
             raise _wrong_size(header, len(content))
         rows = np.frombuffer(content, dtype=_ELEMENT)
-        return [(_text(row["name"]), _of_columns(row["numbers"])) for row in rows]
-    is_matrix = header.kind == "TRANSFORM"
-    if len(content) not in ((48,) if is_matrix else (12, 24, 28)):
+        return [(_text(row["name"]), _unpack_columns(row["numbers"])) for row in rows]
+    if len(content) != 48:
         raise _wrong_size(header, len(content))
-    numbers = np.frombuffer(content, dtype=">f4").astype(np.float64)
-    return [(header.device, _of_columns(numbers) if is_matrix else _of_quaternion(numbers))]
+    return [(header.device, _unpack_columns(np.frombuffer(content, dtype=">f4")))]
 
 
 def pack_transform(
     device: str, stamp: int, matrix: NDArray[np.float64], *, per_pixel: bool = False
 ) -> bytes:
-    """A TRANSFORM message of version 1, at ``stamp`` ns, of an affine matrix (4, 4).
+    """Pack a TRANSFORM message of version 1, at ``stamp`` ns, of an affine matrix (4, 4).
 
-    It leads from metres to metres or, ``per_pixel``, from pixels to metres.
+    The matrix leads from metres to metres or, ``per_pixel``, from pixels to metres.
     """
     numbers = matrix[:3].T.copy()
     numbers[0 if per_pixel else 3 :] /= _METRES
-    return _packed("TRANSFORM", device, stamp, numbers.astype(">f4").tobytes())
+    return _pack("TRANSFORM", device, stamp, numbers.astype(">f4").tobytes())
 
 
 def pack_image(
     device: str, stamp: int, pixels: NDArray[np.uint8], matrix: NDArray[np.float64], world: str
 ) -> bytes:
-    """An IMAGE message of version 1, at ``stamp`` ns, of grey pixels (rows, columns).
+    """Pack an IMAGE message of version 1.
 
     Args:
         device: name of the image.
         stamp: ns.
-        pixels: (rows, columns).
+        pixels: (rows, columns), grey.
         matrix: (4, 4), from (column, row, slice, 1) of pixel centres to m of the world.
         world: "ras" or "lps".
 
@@ -150,10 +147,10 @@ def pack_image(
     numbers = middle[:3].T.ravel() / _METRES
     size = (columns, rows, 1)
     head = _IMAGE.pack(1, 1, _UINT8, _BIG_ENDIAN, _WORLDS[world], *size, *numbers, 0, 0, 0, *size)
-    return _packed("IMAGE", device, stamp, head + np.ascontiguousarray(pixels).tobytes())
+    return _pack("IMAGE", device, stamp, head + np.ascontiguousarray(pixels).tobytes())
 
 
-def _packed(kind: str, device: str, stamp: int, body: bytes) -> bytes:
+def _pack(kind: str, device: str, stamp: int, body: bytes) -> bytes:
     seconds, rest = divmod(stamp, 10**9)
     fraction = min((rest * 2**32 + 5 * 10**8) // 10**9, 2**32 - 1)
     name = device.encode("ascii", "replace")[:NAME_LENGTH]
@@ -169,8 +166,8 @@ def _wrong_size(header: Header, size: int) -> TrackingError:
     return TrackingError(f"a {header.kind} of {header.device!r} has {size} bytes, which cannot be")
 
 
-def _without_extension(header: Header, body: bytes) -> tuple[bytes, dict[str, str]]:
-    """The content and the metadata of a message of version 2 or 3."""
+def _strip_extension(header: Header, body: bytes) -> tuple[bytes, dict[str, str]]:
+    """Return the content and the metadata of a message of version 2 or 3."""
     try:
         begin, heads, values, _ = _EXTENSION.unpack_from(body)
         end = len(body) - heads - values
@@ -189,26 +186,12 @@ def _without_extension(header: Header, body: bytes) -> tuple[bytes, dict[str, st
     return body[begin:end], metadata
 
 
-def _of_columns(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The upper three rows, column after column, mm."""
+def _unpack_columns(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the matrix of its upper three rows, column after column, mm."""
     matrix = np.eye(4)
     matrix[:3] = numbers.reshape(4, 3).T
     matrix[:3, 3] *= _METRES
     return matrix
-
-
-def _of_quaternion(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """x, y, z mm and the quaternion x, y, z, w, of which w or all may be missing; nan where that is
-    none.
-    """
-    quaternion = numbers[3:] if len(numbers) > 3 else np.zeros(3)
-    if len(quaternion) == 3:
-        w = np.sqrt(max(0.0, 1.0 - float(quaternion @ quaternion)))
-        quaternion = np.append(quaternion, w)
-    try:
-        return Pose(_METRES * numbers[:3], quaternion).matrix
-    except PoseError:
-        return np.full((4, 4), np.nan)
 
 
 def _checksum(body: bytes) -> int:
@@ -298,14 +281,15 @@ class OpenIGTLinkClient:
         """Connect and read until the server or `close` ends it.
 
         Raises:
-            OSError, TrackingError: the connection fails, is lost, or is of another protocol.
+            OSError: the connection fails or is lost.
+            TrackingError: it is closed, or of another protocol.
         """
         settings = self._settings
         with socket.create_connection((settings.host, settings.port), _CONNECT_S) as connection:
             self._socket = connection
             connection.settimeout(_SILENT_S)
             if settings.tracking_data:
-                connection.sendall(_packed("STT_TDATA", "", 0, _ASKED))
+                connection.sendall(_pack("STT_TDATA", "", 0, _ASKED))
             self._names.clear()
             self._heard = time.monotonic()
             stream = connection.makefile("rb")
@@ -352,7 +336,7 @@ class OpenIGTLinkClient:
             self._take(Measurement(header.stamp, pose))
 
     def _is_wanted(self, name: str) -> bool:
-        """Whether a name is the body's; reports now and then when only others come."""
+        """Return whether a name is the body's; report now and then when only others come."""
         self._names[name] = None
         if self._body is None:
             if len(self._names) == 1:
@@ -373,11 +357,7 @@ class OpenIGTLinkClient:
 
 
 def _read(stream: BinaryIO, size: int) -> bytes:
-    """Read that many bytes.
-
-    Raises:
-        TrackingError: the server has closed the connection.
-    """
+    """Read that many bytes; raise TrackingError where the server has closed the connection."""
     data = stream.read(size)
     if len(data) < size:
         raise TrackingError("it has closed the connection")
@@ -441,7 +421,7 @@ class OpenIGTLinkServer:
             self._changed.wait_for(lambda: not self._waiting, _CONNECT_S)
 
     def _serve(self, connection: socket.socket, *_: object) -> None:
-        """Send a client what waits for it, until it is gone."""
+        """Send a client the messages that wait for it, until it is gone."""
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         waiting: dict[str, bytes] = {}
         with self._changed:
@@ -461,6 +441,6 @@ class OpenIGTLinkServer:
 
 
 def _shut(connection: socket.socket) -> None:
-    """End both directions, so that nobody waits for it any more."""
+    """Shut both directions down, which ends every wait for it."""
     with contextlib.suppress(OSError):
         connection.shutdown(socket.SHUT_RDWR)

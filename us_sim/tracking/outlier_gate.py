@@ -81,7 +81,7 @@ class OutlierGate:
         return verdict
 
     def _doubt(self, measurement: Measurement) -> str:
-        """Say why a measurement is not believed; nothing if it is."""
+        """Return the reason why a measurement is not believed; "" if it is."""
         before = self._believed
         if before is None:
             return ""
@@ -110,7 +110,7 @@ class OutlierGate:
         )
 
     def _too_fast(self, before: Measurement, measurement: Measurement, step: float) -> str:
-        """Say why a probe cannot have come from one pose to another in a time (s), or nothing."""
+        """Return why a probe cannot come from one pose to another in a time (s); "" if it can."""
         settings, elapsed = self._settings, 1e-6 * (measurement.stamp - before.stamp)
         distance = hypot(*(measurement.pose.position - before.pose.position))
         limit = settings.jump + settings.maximum_speed * step

@@ -11,7 +11,8 @@
 >>> marker_on_grip = Pose([0.0, 0.0, 0.12])  # the probe's face is 120 mm from it
 >>> filter, gate = create_filter("none"), OutlierGate(GateSettings())
 >>> tracking = ProbeTracking(camera_above, marker_on_grip, filter, gate, time_offset=-0.02)
->>> probe = tracking.process_measurement(Measurement(5_000_000_000, Pose([0.0, 0.0, 0.29])), 5_010_000_000)
+>>> seen = Measurement(5_000_000_000, Pose([0.0, 0.0, 0.29]))
+>>> probe = tracking.process_measurement(seen, 5_010_000_000)
 >>> probe.stamp, probe.pose.position.round(6).tolist(), tracking.find_state(5_010_000_000).value
 (4980000000, [0.0, 0.0, 0.01], 'tracked')
 >>> tracking.process_measurement(Measurement(5_010_000_000, Pose([0.0, 0.0, 0.9])), 5_020_000_000)
@@ -40,8 +41,8 @@ class ProbeTracking:
     Args:
         registration: the device's frame in ``patient``.
         calibration: the probe in the tracked body's frame.
-        filter: what smooths the probe's poses in ``patient``.
-        gate: what refuses some of them; None believes all.
+        filter: smooths the probe's poses in ``patient``.
+        gate: refuses some of them; None believes all.
         time_offset: s that are added to the device's stamps.
         coast_for: s without a pose after which the state is *coasting*.
         lost_after: s without a pose after which it is *lost*, and the next one starts anew.
@@ -77,7 +78,7 @@ class ProbeTracking:
         self._start_anew()
 
     def find_state(self, now_ns: int) -> TrackingState:
-        """Whether the probe is tracked at a time of the clock that `process_measurement` is told.
+        """Return the state of tracking at a time (ns) of the clock of `process_measurement`.
 
         Where the clock was set back, the last pose's age counts anew.
         """
@@ -90,19 +91,19 @@ class ProbeTracking:
         return TrackingState.COASTING if age < self._longest_gap else TrackingState.LOST
 
     def count_refusal(self, kind: str, sentence: str) -> None:
-        """Count a measurement that cannot be used, be it one that never became a pose."""
+        """Count a measurement that cannot be used, also one that never became a pose."""
         self.refused[kind] += 1
         self.last_refused, self.last_problem = kind, sentence
 
     def process_measurement(self, measurement: Measurement, now_ns: int) -> Measurement | None:
-        """The probe in ``patient``, or None where the measurement is refused.
+        """Return the probe in ``patient``, or None where the measurement is refused.
 
-        Why is then in `last_problem`, and `last_refused` is what it is counted as in `refused`:
-        "order" (not newer than one before) or "gate".
+        Then `last_problem` has the reason, and `last_refused` the kind under which it is counted in
+        `refused`: "order" (not newer than one before) or "gate".
 
         Args:
             measurement: the tracked body in the device's frame, or the probe in ``patient``.
-            now_ns: when it arrived.
+            now_ns: time of its arrival.
         """
         if not self._in_order(measurement.stamp):
             self.count_refusal("order", "the pose is not newer than the one before it")
@@ -126,7 +127,7 @@ class ProbeTracking:
         return self.filter.update(probe)
 
     def _in_order(self, stamp: int) -> bool:
-        """Whether a stamp is newer, or so much older that the source was started again."""
+        """Return whether a stamp is newer, or so much older that the source was started again."""
         if self._newest is not None:
             step = stamp - self._newest
             if -RESTART_NS < step <= 0:
@@ -146,7 +147,7 @@ class ProbeTracking:
             self._gate.reset()
 
     def _of_probe(self, measurement: Measurement) -> Measurement:
-        """The probe in ``patient`` as measured, with the covariance there."""
+        """Return the probe in ``patient`` as measured, with the covariance there."""
         if measurement.of_probe:
             return measurement
         body = measurement.pose

@@ -30,8 +30,8 @@ LONGEST_STEP = 0.1
 """s, that one motion may make up for where the computer was late."""
 
 
-class Reach(Protocol):
-    """Where a probe may be: m and rad from the origin of ``patient``, with no turn there."""
+class _Reach(Protocol):
+    """Farthest places (m) and turn (rad) of a probe from the origin of ``patient`` and no turn."""
 
     @property
     def aside(self) -> float: ...
@@ -43,8 +43,8 @@ class Reach(Protocol):
     def lean(self) -> float: ...
 
 
-def clip_to_reach(pose: Pose, before: Pose, reach: Reach) -> Pose:
-    """The pose, with its place clipped to the reach, and not turned where that leads beyond it."""
+def clip_to_reach(pose: Pose, before: Pose, reach: _Reach) -> Pose:
+    """Clip a pose's place to the reach, and keep the turn before where it leads beyond it."""
     low = [-reach.aside, -reach.aside, -reach.lift]
     position = np.clip(pose.position, low, [reach.aside, reach.aside, reach.press])
     leans = float(np.linalg.norm(rotation_log(pose.orientation))) > reach.lean
@@ -52,14 +52,15 @@ def clip_to_reach(pose: Pose, before: Pose, reach: Reach) -> Pose:
 
 
 def compute_approach_speed(wanted: float, felt: float, damping: float, most: float) -> float:
-    """m/s along the probe's axis, by which an admittance seeks a force.
+    """Return the speed (m/s) along the probe's axis by which an admittance seeks a force.
 
     Against tissue of k N/m, felt T s late, the force obeys f' = (k / damping) (wanted - f(t - T)).
     It settles for k T / damping < π / 2, and without overshoot up to 1 / e (Hayes, Roots of the
     transcendental equation associated with a certain difference-differential equation, 1950).
 
     Args:
-        wanted, felt: N by which the probe presses, or is to.
+        wanted: N, by which the probe is to press.
+        felt: N, by which it presses.
         damping: N s/m.
         most: m/s.
     """
@@ -132,7 +133,7 @@ class Robot:
         self._wanted = time, force
 
     def update_force(self, time: float, force: float) -> None:
-        """Take the force, N by which the probe presses along its axis."""
+        """Set the force, N by which the probe presses along its axis."""
         self._felt = time, force
 
     def move_until(self, time: float) -> Pose:
@@ -146,7 +147,7 @@ class Robot:
             (slice(3, 6), given.angular_acceleration),
         ):
             change = wanted[part] - self._velocity[part]
-            self._velocity[part] += _shortened(change, most * passed)
+            self._velocity[part] += _shorten(change, most * passed)
         moved = self.pose @ exp(self._velocity * passed)
         self.pose = clip_to_reach(moved, self.pose, given)
         return self.pose
@@ -168,12 +169,12 @@ class Robot:
             else:
                 velocity[2] = 0.0
                 self.action = "without a felt force"
-        velocity[:3] = _shortened(velocity[:3], given.speed)
-        velocity[3:] = _shortened(velocity[3:], given.angular_speed)
+        velocity[:3] = _shorten(velocity[:3], given.speed)
+        velocity[3:] = _shorten(velocity[3:], given.angular_speed)
         return velocity
 
 
-def _shortened(vector: NDArray[np.float64], most: float) -> NDArray[np.float64]:
-    """The vector, no longer than that."""
+def _shorten(vector: NDArray[np.float64], most: float) -> NDArray[np.float64]:
+    """Shorten a vector to a length."""
     length = float(np.linalg.norm(vector))
     return vector * (most / length) if length > most else vector

@@ -212,11 +212,6 @@ class SixDofMouseSettings(Settings):
     section = "six_dof_mouse"
     error = TrackingError
 
-    frame: str = setting(
-        description="whose axes the probe moves along",
-        choices=("probe", "patient"),
-        default="probe",
-    )
     axes: tuple[int, int, int, int, int, int] = setting(
         Quantity("number", 0, 63),
         "which axes of the joystick move along x, y, z and turn about x, y, z",
@@ -254,7 +249,7 @@ class SixDofMouseSettings(Settings):
     )
 
     def check(self) -> None:
-        """Six axes, two buttons, and a home in the workspace."""
+        """Refuse equal axes or buttons, and a home outside the workspace."""
         if len(set(self.axes)) != len(self.axes):
             raise self.make_error(
                 "axes", f"{self.axes} must be six different whole numbers, from 0"
@@ -302,6 +297,6 @@ class OpenIGTLinkSettings(Settings):
     )
 
     def check(self) -> None:
-        """A server has a name."""
+        """Refuse a server without a name."""
         if not self.host.strip():
             raise self.make_error("host", "is empty: name the server, or localhost")

@@ -6,7 +6,8 @@ compressing along its normal, rotating about it, fanning about the probe's x axi
 rocking about its y axis, within the image plane.
 
 >>> from us_sim.tracking.virtual_hand import StanceMotion, StandingSurface, Stance
->>> skin = RestSurface.create_plane(0.1)
+>>> square = np.array([[-0.1, -0.1, 0.0], [0.1, -0.1, 0.0], [0.1, 0.1, 0.0], [-0.1, 0.1, 0.0]])
+>>> skin = StandingSurface(square, np.array([[0, 2, 1], [0, 3, 2]]))
 >>> pressed = Stance([0.02, 0.0, 0.0], press=0.005, fan=math.radians(10))
 >>> (1e3 * pressed.compute_pose(skin).position).round(6).tolist()  # mm
 [20.0, 0.0, 5.0]
@@ -37,7 +38,7 @@ _LEAST_FACING = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Foot:
-    """Where something stands on the surface."""
+    """A place on the surface on which something stands."""
 
     point: NDArray[np.float64]  # (3,) m, on the surface, frame patient
     normal: NDArray[np.float64]  # (3,) unit length, out of the body, without jumps along the skin
@@ -79,16 +80,10 @@ class StandingSurface:
         """(3,) m, the corners of the box around it."""
 
     @classmethod
-    def create_plane(cls, half: float) -> StandingSurface:
-        """The square of z = 0 within ``half`` m around the origin, with the body at z > 0."""
-        vertices = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
-        return cls(np.insert(vertices, 2, 0.0, axis=1), np.array([[0, 2, 1], [0, 3, 2]]))
-
-    @classmethod
     def create_upper_side(
         cls, vertices: NDArray[np.floating], triangles: NDArray[np.integer]
     ) -> StandingSurface:
-        """The part of a closed surface that faces -z, on which a probe can stand.
+        """Make the part of a closed surface that faces -z, on which a probe can stand.
 
         Arguments are as for the class itself.
 
@@ -128,7 +123,7 @@ class StandingSurface:
         return foot
 
     def find_foot(self, position: NDArray[np.float64]) -> tuple[Foot, float]:
-        """Find the foot on whose normal a position (3,) m lies, and how far inwards (m) that is.
+        """Find the foot on whose normal a position (3,) m lies, and its distance inwards (m).
 
         Near the edge of a surface that is not closed there may be none: then it is the closest.
         """
@@ -155,7 +150,7 @@ class StandingSurface:
 def _closest_weights(
     corners: NDArray[np.float64], point: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(T, 3) barycentric weights of the points of triangles (T, 3, 3) m closest to one (3,) m."""
+    """Return weights (T, 3) of the points of triangles (T, 3, 3) m closest to one (3,) m."""
     sides = np.roll(corners, -1, axis=1) - corners  # of each corner to the next
     to = point - corners
     across = np.cross(sides[:, 0], sides[:, 1])
@@ -177,7 +172,7 @@ class Approach:
 
     Its speed is never above ``speed``, its acceleration never above
     ``2 * speed / time_constant``, and half of that from rest. It stays within the triangle of
-    where it is, where its lead is and the goal: from rest, on the straight line to the goal.
+    its place, its lead's and the goal: from rest, on the straight line to the goal.
 
     Args:
         place: (K,) where it rests.
@@ -192,7 +187,7 @@ class Approach:
         self.goal: NDArray[np.float64] = self.place.copy()
 
     def compute_distance(self) -> float:
-        """Return how far it, or its lead, still is from the goal."""
+        """Return the distance to the goal of it or its lead, the larger."""
         return max(math.dist(self.goal, self._lead), math.dist(self.goal, self.place))
 
     def advance(self, seconds: float) -> NDArray[np.float64]:
@@ -233,7 +228,7 @@ class StanceMotion:
     """
 
     def __init__(self, stance: Stance) -> None:
-        point, press, turn = _parts(stance)
+        point, press, turn = _split(stance)
         self._slide = Approach(point, _SLIDING, _TIME_CONSTANT)
         self._press = Approach(press, _PRESSING, _TIME_CONSTANT)
         self._turn = Approach(turn, _TURNING, _TIME_CONSTANT)
@@ -241,23 +236,23 @@ class StanceMotion:
 
     @property
     def stance(self) -> Stance:
-        """Where it is now."""
+        """The stance now."""
         return _stance(self._slide.place, self._press.place, self._turn.place)
 
     @property
     def goal(self) -> Stance:
-        """Where it goes."""
+        """The stance that it goes to."""
         return _stance(self._slide.goal, self._press.goal, self._turn.goal)
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether it is where it goes."""
+        """The goal is reached."""
         metres = max(self._slide.compute_distance(), self._press.compute_distance())
         return metres < _AT_REST and self._turn.compute_distance() < _ALIGNED
 
     def aim_at(self, stance: Stance) -> None:
-        """Go there from now on, turning the shorter way."""
-        self._slide.goal, self._press.goal, turn = _parts(stance)
+        """Go to a stance from now on, turning the shorter way."""
+        self._slide.goal, self._press.goal, turn = _split(stance)
         turn[0] = self._turn.place[0] + wrap_angle(turn[0] - self._turn.place[0])
         self._turn.goal = turn
 
@@ -268,8 +263,8 @@ class StanceMotion:
         return self.stance
 
 
-def _parts(stance: Stance) -> tuple[NDArray[np.float64], ...]:
-    """The point (3,) m, the press (1,) m and the turn (3,) rad."""
+def _split(stance: Stance) -> tuple[NDArray[np.float64], ...]:
+    """Split a stance into the point (3,) m, the press (1,) m and the turn (3,) rad."""
     turn = np.array([stance.rotation, stance.fan, stance.rock])
     return stance.point.copy(), np.array([stance.press]), turn
 
@@ -315,7 +310,7 @@ class Stance:
 
     @classmethod
     def from_pose(cls, pose: Pose, surface: StandingSurface) -> Stance:
-        """Find the stance of a probe that is somewhere already: the way back from `compute_pose`."""
+        """Find the stance of a probe in a pose: the inverse of `compute_pose`."""
         foot, press = surface.find_foot(pose.position)
         x, y, z, w = _upright(foot.normal)
         turned = Pose(
@@ -330,8 +325,9 @@ class Stance:
 
     @classmethod
     def create_home(cls, surface: StandingSurface, press: float) -> Stance:
-        """Stand upright above the origin of ``patient``, or on the middle of a surface not there;
-        ``press`` in m.
+        """Stand upright at the origin of ``patient``, or at the middle of a surface beside it.
+
+        ``press`` is in m.
         """
         middle = 0.5 * (surface.lower + surface.upper)
         inside = (surface.lower[:2] <= 0.0).all() and (surface.upper[:2] >= 0.0).all()
@@ -347,14 +343,14 @@ class Stance:
         return Pose(foot.point - self.press * foot.normal, orientation)
 
     def slide_along(self, surface: StandingSurface, along_x: float, along_y: float) -> Stance:
-        """Slide along the probe's own x and y, m, as it is rotated, to the closest of the skin."""
+        """Slide along the probe's own x and y (m), and stand on the closest point of the skin."""
         foot = surface.find_closest(self.point)
         turned = multiply_quaternions(_upright(foot.normal), rotation_exp(self.rotation * _AXES[2]))
         way = Pose(np.zeros(3), turned).rotation @ np.array([along_x, along_y, 0.0])
         return replace(self, point=surface.find_closest(foot.point + way).point)
 
     def clip_to_reach(self) -> Stance:
-        """Press and turn no further than a hand may."""
+        """Clip press, fan and rock to those of a hand."""
         return replace(
             self,
             press=min(max(self.press, -HIGHEST), DEEPEST),
@@ -370,7 +366,7 @@ def wrap_angle(angle: float) -> float:
 
 
 def _upright(normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4,) quaternion of the smallest turn that brings +z to the inside of a normal (3,).
+    """Return the quaternion (4,) of the smallest turn that brings +z against a normal (3,).
 
     So x stays along the patient's x as far as the skin lets it. On skin that faces exactly down
     every such turn is half a one: it is then about y.

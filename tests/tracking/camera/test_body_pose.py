@@ -115,8 +115,8 @@ def two_poses():
 
 
 def test_two_poses_that_fit_alike_widen_the_covariance_by_their_mixture(two_poses):
-    pose = PlaneAmbiguity(0.1).choose_pose(two_poses, None)
-    covariance = PlaneAmbiguity(0.1).record_choice(two_poses, pose, None)
+    pose = PlaneAmbiguity().choose_pose(two_poses, None)
+    covariance = PlaneAmbiguity().record_choice(two_poses, pose, None)
     # Each is the right one with probability 1 / 2.
     apart = rotation_angle(two_poses[0].pose, two_poses[1].pose)
     wider = np.trace(covariance[3:, 3:]) - np.trace(pose.covariance[3:, 3:])
@@ -126,7 +126,7 @@ def test_two_poses_that_fit_alike_widen_the_covariance_by_their_mixture(two_pose
 
 def test_images_that_speak_for_the_other_pose_win_in_the_end(two_poses):
     first, other = two_poses
-    ambiguity = PlaneAmbiguity(0.1)
+    ambiguity = PlaneAmbiguity()
     ambiguity.record_choice(two_poses, first, None)
     better = dataclasses.replace(other, misfit=0.0)
     chosen = []

@@ -5,7 +5,7 @@ the photos leave open.
 
 >>> from us_sim.tracking.calibration.camera import find_board
 >>> from us_sim.tracking.camera.rigid_body import RigidBody
->>> board = RigidBody.charuco("4X4_50", 5, 4, 0.02, 0.015)
+>>> board = RigidBody.create_charuco("4X4_50", 5, 4, 0.02, 0.015)
 >>> photo = np.full((320, 400), 255, np.uint8)
 >>> photo[40:280, 50:350] = board.chessboard.board.generateImage((300, 240))
 >>> seen = find_board(photo, board)
@@ -48,7 +48,8 @@ class BoardView:
 def find_board(image: NDArray[np.uint8], board: RigidBody) -> BoardView | None:
     """Find a flat board's corners in a grey image (rows, columns), to a part of a pixel.
 
-    None where it shows fewer than six, or they are all in one row.
+    Returns:
+        None where it shows fewer than six, or they are all in one row.
     """
     seen = FiducialDetector(board).detect_markers(image)
     if board.chessboard is not None:
@@ -119,17 +120,20 @@ class CameraCalibration:
 
 
 def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> CameraCalibration:
-    """The camera whose pinhole and lens explain the views of one board from many places best.
+    """Find the camera whose pinhole and lens explain the views of one board best.
 
-    Width and height are those of all photos, in pixels.
+    Args:
+        views: of the board from many places.
+        width: pixels, of every photo.
+        height: pixels, of every photo.
 
     Raises:
         CalibrationError: the views are too few or too alike to determine the camera.
     """
     if len(views) < _FEWEST_VIEWS:
         raise CalibrationError(
-            f"the board is seen in {format_count(len(views), 'photo')}, and {_FEWEST_VIEWS} are the "
-            f"least (20 are good): take more, tilted to all sides"
+            f"the board is seen in {format_count(len(views), 'photo')}, and {_FEWEST_VIEWS} are "
+            f"the least (20 are good): take more, tilted to all sides"
         )
     reach = _reach(views, width, height)
     if reach < _SMALLEST_REACH:
@@ -163,7 +167,7 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Cam
 def _solve(
     views: Sequence[BoardView], used: NDArray[np.bool_], width: int, height: int, reach: float
 ) -> CameraCalibration:
-    """OpenCV's solution for some of the views."""
+    """Solve for the camera by OpenCV, from the views that are used."""
     start: Any = None  # no camera to start from, which OpenCV's type hints do not know
     chosen = list(compress(views, used))
     try:
@@ -197,7 +201,7 @@ def _scale(width: int) -> float:
 
 
 def _reach(views: Sequence[BoardView], width: int, height: int) -> float:
-    """How far corners go from the image's middle: 0 not at all, 1 to its corners."""
+    """Return the farthest corner's distance from the middle, over that of the image's corners."""
     middle = 0.5 * np.array([width - 1, height - 1])
     pixels = np.concatenate([view.pixels for view in views])
     return float(np.linalg.norm(pixels - middle, axis=1).max() / np.linalg.norm(middle))

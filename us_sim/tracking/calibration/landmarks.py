@@ -54,7 +54,7 @@ class LandmarkRegistration:
 def register_landmarks(
     measured: Array, known: Array, names: Sequence[str] = ()
 ) -> LandmarkRegistration:
-    """The rigid transform that lays the measured points on the known ones.
+    """Find the rigid transform that lays the measured points on the known ones.
 
     Args:
         measured: (N, 3) m, in the device's frame.
@@ -138,9 +138,9 @@ def _leave_one_out(measured: Array, known: Array) -> Array:
 
 
 def _deviations(known: Array, origin: Array, residuals: Array) -> Array:
-    """(6,) standard deviations of the transform, for equal errors of all coordinates.
+    """Return standard deviations (6,) m, rad of the transform, for equal errors of all coordinates.
 
-    Of the position of the measured frame's origin, and of the rotation about the axes.
+    They are those of the measured frame's origin, and of the rotation about the axes.
     """
     count = len(known)
     # A rotation w about the landmarks' middle moves a landmark by w × (landmark - middle).

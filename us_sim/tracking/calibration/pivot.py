@@ -26,6 +26,10 @@ from us_sim.geometry.pose import Pose
 Array = NDArray[np.float64]
 
 _WINDOW = 0.2  # s, over which the tip is averaged
+_STEADY = 5  # windows of the shortest stay
+_STILLNESS = 1.5e-3  # m, diagonal of the box in which the averages stay
+_SWING = 0.3  # rad, least swing of one of the stylus' axes meanwhile
+_APART = 5e-3  # m; nearer places are the same one, of which the first counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,26 +41,13 @@ class Dwell:
     start: float  # s
 
 
-def find_dwells(
-    times: Array,
-    tips: Array,
-    rotations: Array,
-    *,
-    stillness: float = 1.5e-3,
-    swing: float = 0.3,
-    seconds: float = 1.0,
-    apart: float = 5e-3,
-) -> list[Dwell]:
-    """The places where the tip stayed, in the order in which it came there first.
+def find_dwells(times: Array, tips: Array, rotations: Array) -> list[Dwell]:
+    """Find the places where the tip stayed, in the order in which it came there first.
 
     Args:
         times: (K,) s, ascending.
         tips: (K, 3) m.
         rotations: (K, 3, 3) of the stylus.
-        stillness: m, diagonal of the box in which the tip's averages stay.
-        swing: how far one of the stylus' axes swings meanwhile, about in rad.
-        seconds: how long at least.
-        apart: m, nearer places are the same one, of which the first counts.
     """
     if len(times) < 2:
         return []
@@ -64,27 +55,22 @@ def find_dwells(
     count = len(times) // size
     means = tips[: count * size].reshape(count, size, 3).mean(axis=1)
     axes = rotations[size - 1 : count * size : size]
-    needed = max(1, round(seconds / _WINDOW))
     dwells: list[Dwell] = []
     start = 0
     for end in range(1, count + 1):
-        if _diagonal(means[start:end]) > stillness:
+        if np.linalg.norm(np.ptp(means[start:end], axis=0)) > _STILLNESS:
             start = end
-        elif end - start >= needed and _swing(axes[start:end]) >= swing:
-            samples = tips[start * size : (start + needed) * size]
+        elif end - start >= _STEADY and _swing(axes[start:end]) >= _SWING:
+            samples = tips[start * size : (start + _STEADY) * size]
             position = samples.mean(axis=0)
-            if all(np.linalg.norm(known.position - position) >= apart for known in dwells):
+            if all(np.linalg.norm(known.position - position) >= _APART for known in dwells):
                 dwells.append(Dwell(position, samples.std(axis=0), float(times[start * size])))
             start = end
     return dwells
 
 
-def _diagonal(points: Array) -> float:
-    return float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0
-
-
 def _swing(rotations: Array) -> float:
-    """How far the axis swings that swings most, about in rad."""
+    """Return the largest swing of an axis, about in rad."""
     return float(np.linalg.norm(np.ptp(rotations, axis=0), axis=0).max())
 
 
@@ -105,17 +91,17 @@ class PivotCalibration:
     pivot: Array  # (3,) m, the fixed point in the device's frame
     rms: float  # m, root mean square distance of the poses' tips from the fixed point
     deviations: Array  # (3,) m, standard deviations of the tip's coordinates
-    swing: float  # rad, how far the direction turns that turns least, root mean square
+    swing: float  # rad, of the direction that turns least, root mean square
     inliers: NDArray[np.bool_]  # (K,) poses that were used
 
     @property
     def rejected(self) -> int:
-        """How many poses lie too far from the others' fixed point."""
+        """Number of poses that lie too far from the others' fixed point."""
         return int((~self.inliers).sum())
 
 
 def calibrate_pivot(poses: Sequence[Pose]) -> PivotCalibration:
-    """The tip that stays in one place, from poses of the body in the device's frame.
+    """Find the tip that stays in one place, from poses of the body in the device's frame.
 
     A third of the poses may be wrong (the tip slipped, the tracker saw a reflection): a start by
     the least sum of distances leaves them out.
@@ -146,10 +132,10 @@ def calibrate_pivot(poses: Sequence[Pose]) -> PivotCalibration:
 
 
 def _check_swing(rotations: Array) -> float:
-    """How far the direction turns that turns least, rad.
+    """Return the turn (rad) of the direction that turns least.
 
     Raises:
-        CalibrationError: so little that the tip's place along it cannot be told.
+        CalibrationError: it is so small that the tip's place along that direction stays open.
     """
     # The least-squares matrix is [I, -mean(R)ᵀ; -mean(R), I]: it is singular exactly when some
     # direction of the body is the same in all poses, for which the mean shortens nothing.
@@ -167,7 +153,7 @@ def _check_swing(rotations: Array) -> float:
 def _least_squares(
     rotations: Array, positions: Array, weights: Array | float = 1.0
 ) -> tuple[Array, Array, float]:
-    """Tip and fixed point (6,), their covariance (6, 6), and the root mean square distance."""
+    """Fit tip and fixed point (6,) m; return also their covariance (6, 6) and the RMS distance."""
     count = len(rotations)
     rows = np.concatenate([rotations, np.tile(-np.eye(3), (count, 1, 1))], axis=2)
     scale = np.sqrt(np.broadcast_to(weights, count))
@@ -180,9 +166,9 @@ def _least_squares(
 
 
 def _consistent(rotations: Array, positions: Array) -> NDArray[np.bool_]:
-    """(K,) which poses agree with most others on a fixed point.
+    """Mark the poses (K,) that agree with most others on a fixed point.
 
-    The least sum of distances, by weights of their inverses (Weiszfeld 1937), is the start.
+    The start is the least sum of distances, by weights of their inverses (Weiszfeld 1937).
     """
     weights = np.ones(len(rotations))
     for _ in range(_ROUNDS):
@@ -204,6 +190,6 @@ def _squared_distances(rotations: Array, positions: Array, solution: Array) -> A
 
 
 def _near(squares: Array) -> NDArray[np.bool_]:
-    """Distances that a normal error of the median's size would have; at least rounding errors."""
+    """Mark squared distances that a normal error of the median's size, or of rounding, may have."""
     variance = float(np.median(squares)) / _MEDIAN_SQUARE
     return np.asarray(squares <= max(variance * _LARGEST_SQUARE, 1e-18))

@@ -40,7 +40,7 @@ class PositionSignal:
 def compute_position_signal(
     times: NDArray[np.float64], positions: NDArray[np.float64]
 ) -> PositionSignal:
-    """The first principal component of positions (K, 3) m at times (K,) s; its sign is arbitrary.
+    """Return the first principal component of positions (K, 3) m at times (K,) s, of either sign.
 
     Raises:
         CalibrationError: there are fewer than 3.
@@ -68,20 +68,20 @@ class TimeOffset:
 
     offset: float  # s
     deviation: float  # s, its standard deviation
-    correlation: float  # there; its sign says whether the two count in the same direction
+    correlation: float  # there; negative where the two count in opposite directions
     residual: float  # of the fixed signal's standard deviation, what the moving leaves unexplained
-    seconds: float  # how long both were compared
+    seconds: float  # that both were compared
 
 
 def find_time_offset(
     moving: PositionSignal, fixed: PositionSignal, *, largest: float = 0.5
 ) -> TimeOffset:
-    """The offset of the moving signal's stamps against the fixed one's.
+    """Find the offset of the moving signal's stamps against the fixed one's.
 
     Args:
         moving: of the device whose stamps are to be mended.
         fixed: of the device whose stamps are right.
-        largest: s, the largest offset to believe; twice as far is looked, since an offset
+        largest: s, the largest offset to believe; twice that is searched, since an offset
             outside may fit half a stroke away too.
 
     Raises:
@@ -96,7 +96,7 @@ def find_time_offset(
     # The denser signal is interpolated at the other's times.
     moving_is_dense = _interval(moving) <= _interval(fixed)
     dense, sparse = (moving, fixed) if moving_is_dense else (fixed, moving)
-    times, values = _compared(dense, sparse, 2.0 * largest)
+    times, values = _select_covered(dense, sparse, 2.0 * largest)
     curve = CubicSpline(dense.times, dense.values)
     step = min(_LARGEST_STEP, 0.5 * _interval(dense))
     tried = np.linspace(-2.0 * largest, 2.0 * largest, 4 * round(largest / step) + 1)
@@ -105,10 +105,10 @@ def find_time_offset(
     # The dense signal at t + shift is the sparse one at t.
     sign = -1.0 if moving_is_dense else 1.0
     _check(sign * tried, correlations, best, largest)
-    shift = _refined(curve, times, values, tried[best], step)
+    shift = _refine_shift(curve, times, values, tried[best], step)
     correlation = _correlation(curve, times, values, shift)
     without = [
-        _refined(curve, np.delete(times, block), np.delete(values, block), shift, 10 * step)
+        _refine_shift(curve, np.delete(times, block), np.delete(values, block), shift, 10 * step)
         for block in np.array_split(np.arange(len(times)), _BLOCKS)
     ]
     spread = np.asarray(without) - np.mean(without)
@@ -120,18 +120,18 @@ def find_time_offset(
 def _correlation(
     curve: CubicSpline, times: NDArray[np.float64], values: NDArray[np.float64], shift: float
 ) -> float:
-    """Correlation of samples with the curve moved later by a shift, s."""
+    """Correlate samples with the curve moved later by a shift, s."""
     return float(np.corrcoef(curve(times + shift), values)[0, 1])
 
 
-def _refined(
+def _refine_shift(
     curve: CubicSpline,
     times: NDArray[np.float64],
     values: NDArray[np.float64],
     shift: float,
     step: float,
 ) -> float:
-    """The best shift within a step of one, s."""
+    """Return the best shift (s) within a step of one."""
     found = minimize_scalar(
         lambda x: 1.0 - _correlation(curve, times, values, x) ** 2,
         bounds=(shift - step, shift + step),
@@ -145,10 +145,10 @@ def _interval(signal: PositionSignal) -> float:
     return float(np.median(np.diff(signal.times)))
 
 
-def _compared(
+def _select_covered(
     dense: PositionSignal, sparse: PositionSignal, furthest: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The sparse signal's samples that the dense one covers at every offset."""
+    """Return the sparse signal's samples that the dense one covers at every offset."""
     first, last = dense.times[0], dense.times[-1]
     inside = (sparse.times - furthest >= first) & (sparse.times + furthest <= last)
     for gap in np.flatnonzero(np.diff(dense.times) > _GAP * _interval(dense)):

@@ -66,7 +66,7 @@ def write_transform(
         pose: of from_frame in to_frame, m.
         from_frame: the frame whose points it takes.
         to_frame: the frame in which it gives them.
-        method: what found it, in a few words.
+        method: of the calibration, in a few words.
         residuals: numbers, arrays and mappings of them by name, SI units.
         more: further keys, of the same kinds.
 
@@ -100,7 +100,7 @@ def write_calibration(path: str | Path, content: Mapping[str, Any]) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Arrays and NumPy's numbers as types that YAML's safe subset can hold."""
+    """Convert arrays and NumPy's numbers to types that YAML's safe subset can hold."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, np.generic):

@@ -1,14 +1,16 @@
-"""The pose of a body of markers from where its points are in one image.
+"""The pose of a body of markers from the places of its points in one image.
 
 A plane has two poses in a perspective image: IPPE (Collins and Bartoli, "Infinitesimal plane-based
 pose estimation", IJCV 109, 2014) gives both, Gauss-Newton refines them, and the evidence of all
 images so far chooses one.
 
 >>> from us_sim.tracking.camera.body_pose import estimate_body_poses
->>> from us_sim.tracking.camera.markers import square
+>>> from us_sim.tracking.camera.markers import compute_square_corners
 >>> camera = CameraModel(640, 480, [[600, 0, 320], [0, 600, 240], [0, 0, 1]])
 >>> true = Pose([0.02, 0.01, 0.4], [1.0, 0.2, 0.1, 0.0])
->>> poses = estimate_body_poses(camera, square(0.04), camera.project(true.apply(square(0.04))))
+>>> corners = compute_square_corners(0.04)
+>>> pixels = camera.project_points(true.transform_points(corners))
+>>> poses = estimate_body_poses(camera, corners, pixels)
 >>> poses[0].pose.position.round(6)
 array([0.02, 0.01, 0.4 ])
 >>> [round(each.error, 1) for each in poses]  # pixels, of the pose and of the other one
@@ -36,7 +38,7 @@ _Guess = tuple[NDArray[np.float64], NDArray[np.float64]]  # rotation (3, 3), pos
 
 
 def solve_plane_poses(points: NDArray[np.float64], rays: NDArray[np.float64]) -> list[_Guess]:
-    """Rotations (3, 3) and positions (3,) m that take points in a plane before their rays.
+    """Find rotations (3, 3) and positions (3,) m that take points in a plane to their rays.
 
     OpenCV's SQPNP, which needs no plane, gives one of the two poses only.
 
@@ -74,13 +76,9 @@ class PlaneAmbiguity:
 
     The right one moves as the last one did, and fits the images better in the long run; a single
     image of a small marker may fit the wrong one better by chance.
-
-    Args:
-        deviation: pixels, with which the poses were estimated.
     """
 
-    def __init__(self, deviation: float) -> None:
-        self._deviation = deviation
+    def __init__(self) -> None:
         self._evidence = 0.0  # log likelihood ratio of the pose that is followed to the other
 
     def reset(self) -> None:
@@ -88,7 +86,7 @@ class PlaneAmbiguity:
         self._evidence = 0.0
 
     def choose_pose(self, found: list[BodyPose], before: Pose | None) -> BodyPose:
-        """The pose that follows the one before, unless by now the images speak for the other."""
+        """Choose the pose that follows the last one, unless by now the images favour the other."""
         if len(found) == 1 or before is None:
             return found[0]
         near, far = _by_nearness(found, before)
@@ -100,7 +98,7 @@ class PlaneAmbiguity:
         """Learn from an image of which a pose was chosen.
 
         Returns:
-            (6, 6) its covariance, that of the mixture of both poses about the chosen one: the
+            Its covariance (6, 6), that of the mixture of both poses about the chosen one: the
             likelier the other is, the wider.
         """
         self._evidence *= _FORGETTING
@@ -117,9 +115,9 @@ class PlaneAmbiguity:
         return np.asarray(pose.covariance + probability * np.outer(apart, apart))
 
     def _ratio(self, one: BodyPose, other: BodyPose) -> float:
-        """Log likelihood ratio, with the noise estimated from the better of both."""
+        """Return the log likelihood ratio, with the noise estimated from the better of both."""
         better = one if one.misfit <= other.misfit else other
-        return 0.5 * (other.misfit - one.misfit) * (self._deviation / better.deviation) ** 2
+        return 0.5 * (other.misfit - one.misfit) * (CORNER_DEVIATION / better.deviation) ** 2
 
 
 def _by_nearness(found: list[BodyPose], before: Pose) -> list[BodyPose]:
@@ -159,7 +157,7 @@ def estimate_body_poses(
     guess: Pose | None = None,
     deviation: float = CORNER_DEVIATION,
 ) -> list[BodyPose]:
-    """The pose of a body of which points are seen, and the other one that a plane may have.
+    """Estimate the pose of a body of which points are seen, and the other that a plane may have.
 
     A square seen from afar looks nearly the same when it is tilted the opposite way about its line
     of sight. So both solutions of every marker (Collins and Bartoli 2014, IPPE) and the guess are
@@ -196,14 +194,14 @@ def estimate_body_poses(
             break
         turn, place = guesses[i]
         known = [each.pose.rotation for each in found]
-        pose = _refined(camera, points, pixels, turn, place, deviation, known)
+        pose = _refine_pose(camera, points, pixels, turn, place, deviation, known)
         if pose is not None:
             found.append(pose)
     return sorted(found, key=lambda each: each.misfit)[:2]
 
 
 def rotation_angle(one: Pose, other: Pose) -> float:
-    """rad, of the rotation from one pose to another."""
+    """Return the angle (rad) of the rotation from one pose to another."""
     cosine = abs(float(one.orientation @ other.orientation))
     return 2.0 * float(np.arccos(min(1.0, cosine)))
 
@@ -214,7 +212,7 @@ def _guesses(
     pixels: NDArray[np.float64],
     owners: NDArray[np.int64] | None,
 ) -> list[_Guess]:
-    """Rotations and positions from the whole body where it is flat, or else from its markers."""
+    """Guess rotations and positions from the whole body if it is flat, or else from its markers."""
     spread = points - points.mean(axis=0)
     extents = np.linalg.svd(spread, compute_uv=False)
     flat = extents[2] <= _FLAT * extents[0]
@@ -229,18 +227,18 @@ def _guesses(
 
 
 def _lengths(residuals: NDArray[np.float64], deviation: float) -> NDArray[np.float64]:
-    """(N,) of residuals (N, 2), in deviations."""
+    """Return the lengths (N,) of residuals (N, 2), in deviations."""
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", residuals, residuals)) / deviation)
 
 
 def _misfit(lengths: NDArray[np.float64]) -> float:
-    """Huber's loss; infinite where a point is not before the camera."""
+    """Return Huber's loss; infinite where a point is not before the camera."""
     near = np.minimum(lengths, _HUBER)
     total = float((near * (2.0 * lengths - near)).sum())
     return total if np.isfinite(total) else np.inf
 
 
-def _refined(
+def _refine_pose(
     camera: CameraModel,
     points: NDArray[np.float64],
     pixels: NDArray[np.float64],

@@ -44,11 +44,11 @@ _LIKENESS = 0.2  # of the contrast: what may be left over, root mean square, of 
 def refine_corners(
     image: NDArray[np.uint8], corners: NDArray[np.float64], cells: int
 ) -> NDArray[np.float64] | None:
-    """The corners (4, 2) pixels of a marker's black square on white.
+    """Refine the corners (4, 2) pixels of a marker's black square on white.
 
-    Across every edge, grey goes from black to white as a logistic function; where, how wide, and
-    between which greys is fitted to the pixels about it by least squares. The edge may
-    bow a little, as lenses make it.
+    Across every edge, grey goes from black to white as a logistic function. Its place, width and
+    both greys are fitted to the pixels about it by least squares. The edge may bow a little, as
+    lenses make it.
 
     Args:
         image: (rows, columns) grey.
@@ -70,7 +70,7 @@ def refine_corners(
 
 
 def _mended(corners: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
-    """The quadrilateral with one corner put where it may be.
+    """Yield the quadrilateral with one corner put where it may be.
 
     A polygon that is fitted to the outline of a slanted square may cut off a sharp tip, or follow
     the shadow beyond it. So each corner in turn is put where it makes a parallelogram, or, as
@@ -119,7 +119,7 @@ def _refine(image, corners, cells, refined):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _meet(ends, edges, k):
-    """Where the edge that ends in corner k and the one that begins there meet."""
+    """Intersect the edge that ends in corner k with the one that begins there."""
     before = (k + 3) % 4
     x, y = ends[k, 0], ends[k, 1]
     for _ in range(4):
@@ -134,7 +134,7 @@ def _meet(ends, edges, k):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _tangent(start, end, edge, x, y):
-    """A point of a bowed edge beside (x, y), and the edge's direction there."""
+    """Return the point of a bowed edge beside (x, y), and the edge's direction there."""
     tx, ty = end[0] - start[0], end[1] - start[1]
     half = 0.5 * math.sqrt(tx * tx + ty * ty)
     tx, ty = 0.5 * tx / half, 0.5 * ty / half
@@ -153,10 +153,10 @@ def _tangent(start, end, edge, x, y):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fit_edge(image, start, end, border, edge, widths, k):
-    """Offset, slope and bow (3,) pixels of an edge from the line of its ends, outwards; whether
-    it was found. ``widths[k]`` is the blur's deviation, kept from round to round.
+    """Fit an edge; return its offset, slope and bow (3,) pixels, and True where it was found.
 
-    Along the edge s goes from -1 to 1; across it, outwards, the grey is
+    They are from the line of its ends, outwards. ``widths[k]`` is the blur's deviation, kept from
+    round to round. Along the edge s goes from -1 to 1; across it, outwards, the grey is
     black + (white - black) S((d - offset - slope s - bow (s² - 1/3)) / width), S the logistic
     function.
     """
@@ -208,18 +208,10 @@ def _fit_edge(image, start, end, border, edge, widths, k):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fit_profile(place, length, reach, edge, widths, k):
-    """Gauss-Newton over offset, slope, bow, black, white and width; see `_fit_edge`."""
-    low, high, lows, highs = 0.0, 0.0, 0, 0
-    for i in range(len(place)):
-        if place[i, 1] < -0.5 * reach:
-            low += place[i, 2]
-            lows += 1
-        elif place[i, 1] > 0.5 * reach:
-            high += place[i, 2]
-            highs += 1
-    if lows == 0 or highs == 0 or not high / highs - low / lows > _LEAST_CONTRAST:
+    """Fit offset, slope, bow, black, white and width by Gauss-Newton; see `_fit_edge`."""
+    black, white = _measure_sides(place, 0.5 * reach)
+    if not white - black > _LEAST_CONTRAST:
         return False
-    black, white = low / lows, high / highs
     edge[:] = 0.0
     width = widths[k]
     # A weak prior, of some pixels' weight, holds the bow to what a lens may do, and the width to
@@ -230,20 +222,7 @@ def _fit_profile(place, length, reach, edge, widths, k):
     slopes = np.empty((len(place), 7))  # the last column is what is left over
     right = np.empty(6)
     for _ in range(_STEPS):
-        contrast = white - black
-        for i in range(len(place)):
-            s = place[i, 0]
-            bend = s * s - 1.0 / 3.0
-            z = (place[i, 1] - edge[0] - edge[1] * s - edge[2] * bend) / width
-            step = 1.0 / (1.0 + math.exp(-_LOGISTIC * z))
-            bell = _LOGISTIC * step * (1.0 - step) * contrast / width
-            slopes[i, 0] = -bell
-            slopes[i, 1] = -bell * s
-            slopes[i, 2] = -bell * bend
-            slopes[i, 3] = 1.0 - step
-            slopes[i, 4] = step
-            slopes[i, 5] = -bell * z
-            slopes[i, 6] = place[i, 2] - black - contrast * step
+        _linearise_profile(place, edge, black, white, width, slopes)
         squares = slopes.T @ slopes
         normal = squares[:6, :6]
         for a in range(6):
@@ -273,13 +252,48 @@ def _fit_profile(place, length, reach, edge, widths, k):
     return left < len(place) * (_LIKENESS * (white - black)) ** 2
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _measure_sides(place, beside):
+    """Return the mean greys inside and outside an edge, from ``beside`` pixels on; NaN of none."""
+    low, high, lows, highs = 0.0, 0.0, 0, 0
+    for i in range(len(place)):
+        if place[i, 1] < -beside:
+            low += place[i, 2]
+            lows += 1
+        elif place[i, 1] > beside:
+            high += place[i, 2]
+            highs += 1
+    return low / lows, high / highs
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _linearise_profile(place, edge, black, white, width, slopes):
+    """Fill slopes (n, 7) with the grey's by the six parameters, and what is left over."""
+    contrast = white - black
+    for i in range(len(place)):
+        s = place[i, 0]
+        bend = s * s - 1.0 / 3.0
+        z = (place[i, 1] - edge[0] - edge[1] * s - edge[2] * bend) / width
+        step = 1.0 / (1.0 + math.exp(-_LOGISTIC * z))
+        bell = _LOGISTIC * step * (1.0 - step) * contrast / width
+        slopes[i, 0] = -bell
+        slopes[i, 1] = -bell * s
+        slopes[i, 2] = -bell * bend
+        slopes[i, 3] = 1.0 - step
+        slopes[i, 4] = step
+        slopes[i, 5] = -bell * z
+        slopes[i, 6] = place[i, 2] - black - contrast * step
+
+
 # No linear algebra library is called, which would take long to compile.
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _solve_definite(matrix, right):
-    """Replace ``right`` (n,) by the solution, with Cholesky's factor of the matrix's (n, n) lower
-    triangle, which is overwritten; False, with ``right`` spoilt, where it is not definite.
+    """Solve a definite system by Cholesky; return False where the matrix is not definite.
+
+    ``right`` (n,) is replaced by the solution, and the lower triangle of the matrix (n, n) by its
+    factor.
     """
     size = len(right)
     for i in range(size):
@@ -320,7 +334,7 @@ def refine_crossing(
     side: float,
     gap: float,
 ) -> NDArray[np.float64] | None:
-    """The corner (2,) pixels of a chessboard's squares.
+    """Refine the corner (2,) pixels of a chessboard's squares.
 
     Grey is a mean, and a contrast with the product of two hyperbolic tangents of the distances to
     the edges. The markers in the white squares are left out.
@@ -344,7 +358,7 @@ def refine_crossing(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _refine_crossing(image, corner, directions, side, gap):
-    """Gauss-Newton over the place, the mean, the contrast and the blur; returns its success."""
+    """Fit place, mean, contrast and blur by Gauss-Newton; return whether there is a crossing."""
     rows, columns = image.shape
     arm = max(2.5, _ARM * side)
     near = max(1.0, _NEAR * gap)
@@ -352,57 +366,22 @@ def _refine_crossing(image, corner, directions, side, gap):
     left, top = int(corner[0]) - reach, int(corner[1]) - reach
     if left < 0 or top < 0 or left + 2 * reach >= columns or top + 2 * reach >= rows:
         return False
-    # Distances to the edges: components along the other edge, of oblique coordinates' sine.
-    ux, uy, vx, vy = directions[0, 0], directions[0, 1], directions[1, 0], directions[1, 1]
-    sine = ux * vy - uy * vx
+    sine = directions[0, 0] * directions[1, 1] - directions[0, 1] * directions[1, 0]
     if abs(sine) < 0.2:
         return False
+    window = (left, top, 2 * reach + 1)
     start_x, start_y = corner[0], corner[1]
     mean, contrast, width = 0.0, 0.0, 0.8
     normal = np.empty((5, 5))
     right = np.empty(5)
-    slopes = np.empty(5)
     for step in range(-1, _CROSSING_STEPS):
-        normal[:] = 0.0
-        right[:] = 0.0
-        left_over, count = 0.0, 0
-        for row in range(top, top + 2 * reach + 1):
-            for column in range(left, left + 2 * reach + 1):
-                x, y = column - corner[0], row - corner[1]
-                # Across the edge along u, and across that along v.
-                across, along = ux * y - uy * x, x * vy - y * vx
-                high, low = max(abs(across), abs(along)), min(abs(across), abs(along))
-                if high > arm or low > near:
-                    continue
-                one = math.tanh(_SLOPE * across / width)
-                other = math.tanh(_SLOPE * along / width)
-                grey = float(image[row, column])
-                rest = grey - mean - contrast * one * other
-                one_slope = _SLOPE / width * (1.0 - one * one)
-                other_slope = _SLOPE / width * (1.0 - other * other)
-                slopes[0] = contrast * (one_slope * uy * other - one * other_slope * vy)
-                slopes[1] = contrast * (-one_slope * ux * other + one * other_slope * vx)
-                slopes[2] = 1.0
-                slopes[3] = one * other
-                slopes[4] = (
-                    -contrast * (one_slope * across * other + one * other_slope * along) / width
-                )
-                for a in range(5):
-                    right[a] += slopes[a] * rest
-                    for b in range(a + 1):
-                        normal[a, b] += slopes[a] * slopes[b]
-                left_over += rest * rest
-                count += 1
+        left_over, count = _linearise_crossing(
+            image, window, corner, directions, (arm, near), (mean, contrast, width), normal, right
+        )
         if count < 12:
             return False
         if step < 0:
-            # First only the mean and the contrast, of which nothing is known yet.
-            for a in (0, 1, 4):
-                normal[a, a] += 1.0
-                right[a] = 0.0
-                for b in range(5):
-                    if b != a:
-                        normal[max(a, b), min(a, b)] = 0.0
+            _hold_place_and_blur(normal, right)
         else:
             normal[4, 4] += (0.05 * contrast) ** 2
             right[4] -= (0.05 * contrast) ** 2 * (width - 0.8)
@@ -423,3 +402,55 @@ def _refine_crossing(image, corner, directions, side, gap):
         if step >= 0 and length < _CROSSING_STEADY:
             break
     return left_over < count * (_CROSSING_LIKENESS * contrast) ** 2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _linearise_crossing(image, window, corner, directions, limits, grey, normal, right):
+    """Fill the normal matrix (5, 5), its lower triangle, and the right side (5,) of a crossing.
+
+    ``window`` is left, top and size; ``limits`` are the distances (pixels) to which edges are
+    followed, and used beside them; ``grey`` is mean, contrast and blur. Return the sum of squares
+    that is left over, and the count of pixels.
+    """
+    (left, top, size), (arm, near), (mean, contrast, width) = window, limits, grey
+    ux, uy, vx, vy = directions[0, 0], directions[0, 1], directions[1, 0], directions[1, 1]
+    slopes = np.empty(5)
+    normal[:] = 0.0
+    right[:] = 0.0
+    left_over, count = 0.0, 0
+    for row in range(top, top + size):
+        for column in range(left, left + size):
+            x, y = column - corner[0], row - corner[1]
+            # Distances from the edges along u and along v.
+            across, along = ux * y - uy * x, x * vy - y * vx
+            high, low = max(abs(across), abs(along)), min(abs(across), abs(along))
+            if high > arm or low > near:
+                continue
+            one = math.tanh(_SLOPE * across / width)
+            other = math.tanh(_SLOPE * along / width)
+            rest = float(image[row, column]) - mean - contrast * one * other
+            one_slope = _SLOPE / width * (1.0 - one * one)
+            other_slope = _SLOPE / width * (1.0 - other * other)
+            slopes[0] = contrast * (one_slope * uy * other - one * other_slope * vy)
+            slopes[1] = contrast * (-one_slope * ux * other + one * other_slope * vx)
+            slopes[2] = 1.0
+            slopes[3] = one * other
+            slopes[4] = -contrast * (one_slope * across * other + one * other_slope * along) / width
+            for a in range(5):
+                right[a] += slopes[a] * rest
+                for b in range(a + 1):
+                    normal[a, b] += slopes[a] * slopes[b]
+            left_over += rest * rest
+            count += 1
+    return left_over, count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _hold_place_and_blur(normal, right):
+    """Leave only the mean and the contrast to be solved for, since nothing is known of them yet."""
+    for a in (0, 1, 4):
+        normal[a, a] += 1.0
+        right[a] = 0.0
+        for b in range(5):
+            if b != a:
+                normal[max(a, b), min(a, b)] = 0.0

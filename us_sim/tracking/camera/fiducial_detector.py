@@ -2,11 +2,13 @@
 
 >>> import cv2, numpy as np
 >>> from us_sim.tracking.camera.fiducial_detector import FiducialDetector
->>> from us_sim.tracking.camera.markers import dictionary
+>>> from us_sim.tracking.camera.markers import load_dictionary
 >>> from us_sim.tracking.camera.rigid_body import RigidBody
 >>> image = np.full((200, 200), 255, np.uint8)
->>> image[50:150, 60:160] = cv2.aruco.generateImageMarker(dictionary("4X4_50"), 7, 100)
->>> found = FiducialDetector(RigidBody.single("4X4_50", 7, 0.04)).detect_markers(image)
+>>> marker = cv2.aruco.generateImageMarker(load_dictionary("4X4_50"), 7, 100)
+>>> image[50:150, 60:160] = marker
+>>> body = RigidBody.create_single("4X4_50", 7, 0.04)
+>>> found = FiducialDetector(body).detect_markers(image)
 >>> found.ids
 array([7])
 >>> np.allclose(found.corners[0, [0, 2]], [[59.5, 49.5], [159.5, 149.5]], atol=0.1)
@@ -44,9 +46,9 @@ class Detection:
     def match_points(
         self, body: RigidBody
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-        """Return points of the body (N, 3) m, of the image (N, 2) pixels, and whose they are (N,).
+        """Return points of the body (N, 3) m, of the image (N, 2) pixels, and their owners (N,).
 
-        The last is the marker's row in the body, or -1 of a ChArUco board's chessboard corner.
+        An owner is the marker's row in the body, or -1 of a ChArUco board's chessboard corner.
         Where those are spread over the board they stand alone, since a crossing of edges is where
         it is however bold the print or bright the light, and the edge of a marker is not.
         """
@@ -68,7 +70,7 @@ class Detection:
 
 
 def _is_spread(points: NDArray[np.float64]) -> bool:
-    """Tell if points of a plane are enough for a pose, and not nearly in a line."""
+    """Return whether points of a plane are enough for a pose, and not nearly in a line."""
     if len(points) < 4:
         return False
     extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
@@ -98,8 +100,8 @@ class FiducialDetector:
 
         Args:
             image: grey.
-            window: left, top, right and bottom pixel of where to look; default: everywhere.
-            reduction: look in an image so many times smaller, which is faster and misses small
+            window: left, top, right and bottom pixel of the part to search; default: all.
+            reduction: search an image so many times smaller, which is faster and misses small
                 markers; the corners are still those of the whole image.
         """
         left, top, right, bottom = window or (0, 0, image.shape[1], image.shape[0])
@@ -136,7 +138,7 @@ class FiducialDetector:
     def _crossings(
         self, image: NDArray[np.uint8], numbers: NDArray[np.int64], places: NDArray[np.float32]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Find which chessboard corners (k,) are clear, and where (k, 2) pixels.
+        """Find the chessboard corners that are clear: their numbers (k,) and pixels (k, 2).
 
         Each is fitted between its neighbours.
         """

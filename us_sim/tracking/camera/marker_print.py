@@ -2,7 +2,7 @@
 
 >>> from us_sim.tracking.camera.marker_print import lay_out_sheets
 >>> from us_sim.tracking.camera.rigid_body import RigidBody
->>> sheet, = lay_out_sheets(RigidBody.single("4X4_50", 7, 0.04))
+>>> sheet, = lay_out_sheets(RigidBody.create_single("4X4_50", 7, 0.04))
 >>> sheet.marked[0].round(1)  # mm from the paper's upper left corner
 array([[16.7, 16.7],
        [56.7, 16.7],
@@ -119,7 +119,7 @@ def print_markers(body: RigidBody, out: Path, paper: str = "A4") -> list[Sheet]:
 
 
 def _is_flat(body: RigidBody) -> bool:
-    """Tell if all markers are in one plane and face the same way."""
+    """Return whether all markers are in one plane and face the same way."""
     offsets = (body.corners - body.corners[0, 0]) @ body.normals[0]
     return bool(np.abs(offsets).max() <= _FLAT and (body.normals @ body.normals[0]).min() >= 0.999)
 

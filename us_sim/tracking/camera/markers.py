@@ -28,7 +28,7 @@ from us_sim.tracking.settings import DICTIONARIES
 
 @lru_cache(maxsize=32)
 def load_dictionary(name: str) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of a name, with or without ``DICT_``.
+    """Load OpenCV's dictionary of a name, with or without ``DICT_``.
 
     Raises:
         TrackingError: there is no such dictionary, or OpenCV is too old to find markers.
@@ -43,7 +43,7 @@ def load_dictionary(name: str) -> cv2.aruco.Dictionary:
 
 
 def normalise_name(name: str) -> str:
-    """The name as `DICTIONARIES` writes it.
+    """Return the name as `DICTIONARIES` writes it.
 
     Raises:
         TrackingError: there is no such dictionary.
@@ -58,18 +58,12 @@ def normalise_name(name: str) -> str:
 
 
 def count_markers(name: str) -> int:
-    """How many markers a dictionary has; they are numbered from 0."""
+    """Count the markers of a dictionary; they are numbered from 0."""
     return int(load_dictionary(name).bytesList.shape[0])
 
 
-def find_largest_dictionary(name: str) -> str:
-    """The largest dictionary that has all the markers of this one under the same numbers."""
-    bits, _, count = name.rpartition("_")
-    return f"{bits}_1000" if count.isdigit() else name
-
-
 def compute_square_corners(size: float) -> NDArray[np.float64]:
-    """(4, 3) m: corners of a marker's black square about its middle, as OpenCV orders them.
+    """Return the corners (4, 3) m of a marker's black square about its middle, in OpenCV's order.
 
     x is to its right, y up and z out of the paper, towards who looks at it; the corners are the
     upper left one and on, clockwise.
@@ -95,7 +89,7 @@ _COVERED = 0.5  # the same about any place: more is a hand, or another thing bef
 
 @lru_cache(maxsize=1024)
 def compute_marker_cells(name: str, number: int) -> NDArray[np.uint8]:
-    """(n, n) 0 or 1: cells of a marker of a dictionary, one of white about it."""
+    """Return the cells (n, n) of a marker of a dictionary, 0 or 1, with one of white about it."""
     marker = load_dictionary(name)
     cells = cv2.aruco.generateImageMarker(marker, number, marker.markerSize + 2)
     found = np.pad(np.asarray(cells, dtype=np.uint8) // 255, 1, constant_values=1)
@@ -106,7 +100,7 @@ def compute_marker_cells(name: str, number: int) -> NDArray[np.uint8]:
 def fit_corners(
     image: NDArray[np.uint8], corners: NDArray[np.float64], cells: NDArray[np.uint8]
 ) -> NDArray[np.float64] | None:
-    """The corners (4, 2) pixels of a marker's black square.
+    """Fit the corners (4, 2) pixels of a marker's black square.
 
     Args:
         image: (rows, columns) grey.
@@ -177,9 +171,10 @@ class _View:
         return _mapped(self._homography, self._square) + self._first
 
     def step(self, doubting: bool) -> bool:
-        """One of Gauss and Newton; whether it leads anywhere.
+        """Take a step of Gauss and Newton; return whether it leads anywhere.
 
-        When doubting, what differs by far is a hand, or a gleam: it pulls less (Cauchy's weights).
+        When doubting, a pixel that differs by far is a hand's, or a gleam's: it pulls less
+        (Cauchy's weights).
         """
         drawn = self._draw()
         within = self._within(self._seen)
@@ -213,7 +208,7 @@ class _View:
         return True
 
     def is_explained(self) -> bool:
-        """Whether the residual is small, overall and everywhere."""
+        """Return whether the residual is small, overall and everywhere."""
         inside = self._within(self._judged).astype(np.float32)
         squares = inside * self._left**2
         if squares.sum() > (_UNEXPLAINED * self._contrast) ** 2 * inside.sum():
@@ -226,7 +221,7 @@ class _View:
         return worst < (_COVERED * self._contrast) ** 2
 
     def _within(self, square: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """The pixels of the part that a square of the pattern (4, 2) covers."""
+        """Mark the pixels of the part that a square of the pattern (4, 2) covers."""
         inside = np.zeros(self._part.shape, np.uint8)
         outline = 16 * np.nan_to_num(_mapped(self._homography, square))
         outline = np.clip(np.round(outline), -(2**20), 2**20)
@@ -234,7 +229,7 @@ class _View:
         return inside > 0
 
     def _draw(self) -> NDArray[np.float32]:
-        """The pattern, black 0 and white 1, as the homography and the blur make it appear."""
+        """Draw the pattern, black 0 and white 1, as the homography and the blur make it appear."""
         rows, columns = self._part.shape
         cell = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, _DRAWN]]) / _DRAWN
         middle = 0.5 * (_FINER - 1)
@@ -256,7 +251,7 @@ def _square(low: float, high: float) -> NDArray[np.float64]:
 
 
 def _mapped(homography: NDArray[Any], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points (N, 2) where a homography (3, 3) takes them."""
+    """Map points (N, 2) by a homography (3, 3)."""
     places = np.column_stack([points, np.ones(len(points))]) @ homography.T
     return np.asarray(places[:, :2] / places[:, 2:])
 
@@ -264,7 +259,7 @@ def _mapped(homography: NDArray[Any], points: NDArray[np.float64]) -> NDArray[np
 def _least_squares(
     columns: NDArray[np.floating], right: NDArray[np.floating], weights: NDArray[np.floating]
 ) -> NDArray[np.float32] | None:
-    """The solution (P,) for columns (N, P) and weights (N,); None where there is none."""
+    """Return the solution (P,) for columns (N, P) and weights (N,); None where there is none."""
     weighted = columns.T * weights
     normal = (weighted @ columns).astype(np.float64)
     normal[np.diag_indices(len(normal))] *= 1.0 + 1e-6

@@ -58,7 +58,6 @@ class CameraModel:
 
     def __post_init__(self) -> None:
         matrix: NDArray[np.float64] = _numbers(self.matrix, "the camera matrix").ravel()
-        distortion = _numbers(self.distortion, "the distortion").ravel()
         if matrix.size != 9:
             raise TrackingError(f"the camera matrix has {matrix.size} numbers; it needs 3 × 3")
         matrix = matrix.reshape(3, 3)
@@ -77,6 +76,16 @@ class CameraModel:
             raise TrackingError(
                 f"the camera matrix {matrix.tolist()} must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
             )
+        model, distortion = self._check_distortion()
+        for array in (matrix, distortion):
+            array.flags.writeable = False
+        object.__setattr__(self, "distortion_model", model)
+        object.__setattr__(self, "matrix", matrix)
+        object.__setattr__(self, "distortion", distortion)
+
+    def _check_distortion(self) -> tuple[str, NDArray[np.float64]]:
+        """Return the name and the coefficients of the lens model, as OpenCV has them."""
+        distortion = _numbers(self.distortion, "the distortion").ravel()
         model = self.distortion_model or "plumb_bob"
         if model == "fisheye":  # as some drivers call it
             model = "equidistant"
@@ -92,11 +101,7 @@ class CameraModel:
             raise TrackingError(
                 f"the camera's distortion has {distortion.size} coefficients; {model} has {counts}"
             )
-        for array in (matrix, distortion):
-            array.flags.writeable = False
-        object.__setattr__(self, "distortion_model", model)
-        object.__setattr__(self, "matrix", matrix)
-        object.__setattr__(self, "distortion", distortion)
+        return model, distortion
 
     def project_points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Project points (N, 3) m to pixels (N, 2); NaN for those not before the camera."""
@@ -131,9 +136,7 @@ class CameraModel:
         return pixels, slopes
 
     def compute_rays(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Rays x / z and y / z (N, 2) through pixels (N, 2); NaN where the lens model has
-        no such point.
-        """
+        """Return rays x / z and y / z (N, 2) through pixels (N, 2); NaN beyond the lens model."""
         pixels = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
         if not len(pixels):
             return np.empty((0, 2))
@@ -213,7 +216,7 @@ def write_camera_info(
 ) -> None:
     """Write the file that `read_camera_info` and ROS's drivers read.
 
-    The notes are further keys, which readers pass over: how it was calibrated, and how well.
+    The notes are further keys on the calibration, which readers pass over.
 
     Raises:
         TrackingError: the file exists.
@@ -238,7 +241,7 @@ def write_camera_info(
 
 
 def _data(content: Mapping[str, Any], key: str) -> Any:
-    """The numbers of ``{rows, cols, data}``."""
+    """Return the numbers of ``{rows, cols, data}``."""
     matrix = content[key]
     if not isinstance(matrix, Mapping) or "data" not in matrix:
         raise TrackingError(f"{key} must be a mapping with rows, cols and data")

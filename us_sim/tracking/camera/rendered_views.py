@@ -7,11 +7,11 @@
 >>> from us_sim.tracking.camera.source import CameraSource
 >>> from us_sim.tracking.camera.rigid_body import RigidBody
 >>> camera = CameraModel(320, 240, [[300, 0, 160], [0, 300, 120], [0, 0, 1]], [-0.2, 0, 0, 0, 0])
->>> marker = RigidBody.single("4X4_50", 7, 0.04)
+>>> marker = RigidBody.create_single("4X4_50", 7, 0.04)
 >>> image = RenderedView(camera, marker).render(Pose([0.02, 0.0, 0.25], [1, 0.1, 0, 0]), SHARP)
 >>> image.shape, image.dtype
 ((240, 320), dtype('uint8'))
->>> CameraSource(camera, marker).measure(image, 0).pose.position.round(3) + 0.0
+>>> CameraSource(camera, marker).measure_pose(image, 0).pose.position.round(3) + 0.0
 array([0.02, 0.  , 0.25])
 """
 
@@ -70,8 +70,8 @@ class RenderedView:
     give the same bytes.
 
     Args:
-        camera: what looks.
-        body: what is looked at. Sheets of paper around its markers are white.
+        camera: of the view.
+        body: in the view. Sheets of paper around its markers are white.
         seed: of the background.
     """
 
@@ -92,11 +92,11 @@ class RenderedView:
         motion: NDArray[np.float64] | None = None,
         frame: int = 0,
     ) -> NDArray[np.uint8]:
-        """The image (rows, columns), grey.
+        """Render the image (rows, columns), grey.
 
         Args:
             pose: of the body in ``camera_optical``, in the middle of the exposure.
-            conditions: what makes the image worse.
+            conditions: that degrade the image.
             seed: of the hand and the light's direction, and with the frame of the noise.
             motion: (6,) m and rad, shift and rotation about the camera's axes from the beginning
                 to the end of the exposure.
@@ -125,7 +125,7 @@ class RenderedView:
         return image8
 
     def _moments(self, pose: Pose, motion: NDArray[np.float64] | None) -> list[Pose]:
-        """Poses during the exposure, so close that their sum is smooth."""
+        """Return poses during the exposure, so close that their sum is smooth."""
         if motion is None:
             return [pose]
         ends = [_moved(pose, fraction * motion) for fraction in (-0.5, 0.5)]
@@ -196,7 +196,7 @@ class RenderedView:
                 cv2.line(image, one, other, grey, thickness, lineType=cv2.LINE_8, shift=4)
 
     def _gradient(self, loss: float, random: np.random.Generator) -> NDArray[np.float32]:
-        """(rows, columns) fraction of the light, 1 at one side of the image."""
+        """Return the light (rows, columns), 1 at one side of the image."""
         angle = random.uniform(0, 2 * np.pi)
         width, height = self.camera.width, self.camera.height
         x = (np.arange(width, dtype=np.float32) / width - 0.5) * np.float32(np.cos(angle))
@@ -207,7 +207,7 @@ class RenderedView:
 
 
 def _moved(pose: Pose, motion: NDArray[np.float64]) -> Pose:
-    """Shifted and turned about its own origin, both along the camera's axes."""
+    """Shift a pose, and turn it about its own origin, both along the camera's axes."""
     turned = multiply_quaternions(rotation_exp(motion[3:]), pose.orientation)
     return Pose(pose.position + motion[:3], turned)
 
@@ -216,7 +216,7 @@ _BLANK = np.ones((1, 1), dtype=np.bool_)
 
 
 def _sheets(body: RigidBody) -> list[Print]:
-    """White paper first, then the print on it."""
+    """Yield white paper first, then the print on it."""
     if body.chessboard is not None:
         print_ = body.prints[0]
         a, b = (0.5 * body.chessboard.square * axis for axis in np.eye(3)[:2])
@@ -231,7 +231,7 @@ def _sheets(body: RigidBody) -> list[Print]:
 
 
 def _background(camera: CameraModel, random: np.random.Generator) -> NDArray[np.float32]:
-    """A room out of focus, with things in it that have edges."""
+    """Draw a room out of focus, with things in it that have edges."""
     size = (camera.width, camera.height)
     coarse = random.uniform(50, 170, (9, 12)).astype(np.float32)
     room = np.asarray(cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC), dtype=np.float32)
@@ -253,7 +253,8 @@ def _print(image, rays, inverse, cells, black, white):
         inverse: (3, 3) of the matrix of the sheet's upper edge, left edge and upper left corner,
             so that it takes a ray to the place on the sheet, times what depth is divided by.
         cells: (rows, columns), True is white.
-        black, white: grey.
+        black: grey.
+        white: grey.
     """
     height, width = image.shape
     rows, columns = cells.shape
@@ -281,24 +282,34 @@ def _print(image, rays, inverse, cells, black, white):
             if right <= column + 1 and bottom <= row + 1 and column >= 0 and row >= 0:
                 image[i, j] = white if cells[row, column] else black
                 continue
-            total, inside = 0.0, 0
-            for k in range(_SAMPLES):
-                for m in range(_SAMPLES):
-                    # No two samples lie in a row or a column, so that no slant is favoured.
-                    s = (k + (m + 0.5) / _SAMPLES) / _SAMPLES
-                    t = (m + (k + 0.5) / _SAMPLES) / _SAMPLES
-                    across = (1 - t) * ((1 - s) * xa + s * xb) + t * ((1 - s) * xc + s * xd)
-                    along = (1 - t) * ((1 - s) * ya + s * yb) + t * ((1 - s) * yc + s * yd)
-                    if 0 <= across < columns and 0 <= along < rows:
-                        inside += 1
-                        total += white if cells[int(along), int(across)] else black
+            x4, y4 = (xa, xb, xc, xd), (ya, yb, yc, yd)
+            total, inside = _sum_samples(cells, x4, y4, black, white)
             weight = 1.0 / (_SAMPLES * _SAMPLES)
             image[i, j] = weight * total + (1 - weight * inside) * image[i, j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _sum_samples(cells, x, y, black, white):
+    """Sum the grey of samples in a pixel with corners at x (4), y (4) cells, and count them."""
+    (xa, xb, xc, xd), (ya, yb, yc, yd) = x, y
+    rows, columns = cells.shape
+    total, inside = 0.0, 0
+    for k in range(_SAMPLES):
+        for m in range(_SAMPLES):
+            # No two samples lie in a row or a column, so that no slant is favoured.
+            s = (k + (m + 0.5) / _SAMPLES) / _SAMPLES
+            t = (m + (k + 0.5) / _SAMPLES) / _SAMPLES
+            across = (1 - t) * ((1 - s) * xa + s * xb) + t * ((1 - s) * xc + s * xd)
+            along = (1 - t) * ((1 - s) * ya + s * yb) + t * ((1 - s) * yc + s * yd)
+            if 0 <= across < columns and 0 <= along < rows:
+                inside += 1
+                total += white if cells[int(along), int(across)] else black
+    return total, inside
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _expose(light, noise, read_variance, shot_variance, image):
-    """Grey levels (h, w) of the light, with noise that grows with it."""
+    """Return grey levels (h, w) of the light, with noise that grows with it."""
     for i in range(light.shape[0]):
         for j in range(light.shape[1]):
             value = light[i, j]

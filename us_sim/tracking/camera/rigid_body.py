@@ -85,11 +85,11 @@ class Chessboard:
 
     @cached_property
     def corners(self) -> NDArray[np.float64]:
-        """(K, 3) m: where four squares meet, row by row."""
+        """(K, 3) m: the places in which four squares meet, row by row."""
         return np.asarray(self.board.getChessboardCorners(), dtype=np.float64).reshape(-1, 3)
 
     def compute_squares(self, centres: NDArray[np.float64]) -> Print:
-        """The squares without their markers, of which the middles (M, 3) m are in white ones."""
+        """Return the squares without markers, white where the middles (M, 3) m of those are."""
         white = np.zeros((self.rows, self.columns), dtype=np.bool_)
         column, row = np.floor(centres[:, :2] / self.square).astype(int).T
         white[row, column] = True
@@ -130,7 +130,7 @@ class RigidBody:
 
     @classmethod
     def create_single(cls, dictionary: str, number: int, size: float) -> RigidBody:
-        """One marker; its middle is the origin, x to its right, y up and z out of the paper.
+        """Make a body of one marker about its middle, x to its right, y up and z out of the paper.
 
         Raises:
             TrackingError: there is no such marker.
@@ -147,7 +147,7 @@ class RigidBody:
         separation: float,
         first: int = 0,
     ) -> RigidBody:
-        """A board of markers, numbered row by row from ``first``.
+        """Make a board of markers, numbered row by row from ``first``.
 
         The origin is the upper left corner of the board, x to the right, y down and z into the
         paper, as OpenCV has it.
@@ -170,7 +170,7 @@ class RigidBody:
         size: float,
         legacy: bool = False,
     ) -> RigidBody:
-        """A ChArUco board of so many squares; its frame is as that of `create_grid`.
+        """Make a ChArUco board of so many squares; its frame is as that of `create_grid`.
 
         Raises:
             TrackingError: the markers are larger than squares, or the dictionary is too small.
@@ -187,7 +187,7 @@ class RigidBody:
 
     @cached_property
     def prints(self) -> list[Print]:
-        """What is printed of it on white, each over those before."""
+        """The prints of it on white, each over those before."""
         printed = [] if self.chessboard is None else [self.chessboard.compute_squares(self.centres)]
         marker = load_dictionary(self.dictionary)
         cells = marker.markerSize + 2
@@ -222,7 +222,7 @@ _COUNT, _SQUARES = Quantity("number", 1, 100), Quantity("number", 2, 100)
 
 @dataclass(frozen=True, kw_only=True)
 class _Marker(Placement):
-    """A marker of a body: its size, and where its middle is in the body."""
+    """A marker of a body: its size, and the place of its middle in the body."""
 
     error = TrackingError
 
@@ -243,7 +243,7 @@ class GridBoard(Settings):
     first: int = setting(_NUMBER, "number of the first marker", default=0)
 
     def create_body(self, dictionary: str) -> RigidBody:
-        """The board of markers of a dictionary."""
+        """Make the board with markers of a dictionary."""
         return RigidBody.create_grid(dictionary, **asdict(self))
 
 
@@ -260,7 +260,7 @@ class CharucoBoard(Settings):
     legacy: bool = setting(description="as OpenCV before 4.6 drew it", default=False)
 
     def create_body(self, dictionary: str) -> RigidBody:
-        """The board with markers of a dictionary."""
+        """Make the board with markers of a dictionary."""
         return RigidBody.create_charuco(dictionary, **asdict(self))
 
 
@@ -276,7 +276,7 @@ _BOARDS = Choice(
 
 @dataclass(frozen=True)
 class _Body(Settings):
-    """The file."""
+    """The file of a body."""
 
     error = TrackingError
 
@@ -287,7 +287,7 @@ class _Body(Settings):
     )
 
     def check(self) -> None:
-        """Markers or a board."""
+        """Refuse a file with markers and a board, or neither."""
         if bool(self.markers) == (self.board is not None):
             raise self.make_error("markers", "give a list of markers, or a board in place of it")
 

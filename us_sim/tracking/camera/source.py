@@ -1,11 +1,12 @@
 """Poses of a body by a camera: images from a device, stream or file, a measurement from each.
 
 >>> from us_sim.tracking.camera.source import CameraSource
->>> from us_sim.tracking.camera.markers import dictionary
+>>> from us_sim.tracking.camera.markers import load_dictionary
 >>> camera = CameraModel(640, 480, [[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1]])
->>> source = CameraSource(camera, RigidBody.single("4X4_50", 7, 0.04))
+>>> source = CameraSource(camera, RigidBody.create_single("4X4_50", 7, 0.04))
 >>> image = np.full((480, 640), 255, np.uint8)
->>> image[200:280, 280:360] = cv2.aruco.generateImageMarker(dictionary("4X4_50"), 7, 80)
+>>> marker = cv2.aruco.generateImageMarker(load_dictionary("4X4_50"), 7, 80)
+>>> image[200:280, 280:360] = marker
 >>> source.measure_pose(image, 0).pose.position.round(2) + 0.0
 array([0.  , 0.  , 0.25])
 >>> source.measure_pose(np.zeros_like(image), 33_000_000)
@@ -27,14 +28,9 @@ from numpy.typing import NDArray
 from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.spelling import format_count
-from us_sim.tracking.camera.body_pose import (
-    CORNER_DEVIATION,
-    BodyPose,
-    PlaneAmbiguity,
-    estimate_body_poses,
-)
+from us_sim.tracking.camera.body_pose import BodyPose, PlaneAmbiguity, estimate_body_poses
 from us_sim.tracking.camera.fiducial_detector import Detection, FiducialDetector
-from us_sim.tracking.camera.markers import find_largest_dictionary, load_dictionary
+from us_sim.tracking.camera.markers import load_dictionary
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rigid_body import RigidBody
 from us_sim.tracking.measurement import Measurement
@@ -64,13 +60,12 @@ class CameraSource:
         self.body = body
         self.settings = settings or CameraSettings()
         self.last_problem = ""
-        """Why the last image gave no measurement, or what was left out of it; empty when all is
-        well."""
+        """Reason why the last image gave no measurement, or less; "" when all is well."""
         self.seen = 0
         """Markers of the body that the last measurement is made from."""
         self._detector = FiducialDetector(body)
         self._last: tuple[int, Pose] | None = None
-        self._ambiguity = PlaneAmbiguity(CORNER_DEVIATION)
+        self._ambiguity = PlaneAmbiguity()
 
     def reset(self) -> None:
         """Forget the last pose."""
@@ -78,7 +73,7 @@ class CameraSource:
         self._ambiguity.reset()
 
     def measure_pose(self, image: NDArray[np.uint8], stamp: int) -> Measurement | None:
-        """The body's pose in ``camera_optical``, or None with the reason in ``last_problem``.
+        """Measure the body's pose in ``camera_optical``; None with the reason in ``last_problem``.
 
         Args:
             image: (rows, columns) grey.
@@ -105,7 +100,7 @@ class CameraSource:
         return Measurement(stamp, pose.pose, covariance, pose.error)
 
     def _before(self, stamp: int) -> Pose | None:
-        """The last pose, where it is from shortly before."""
+        """Return the last pose, if it is from shortly before."""
         if self._last is None:
             return None
         if not 0 <= stamp - self._last[0] <= REMEMBERED * 1e9:
@@ -114,7 +109,7 @@ class CameraSource:
         return self._last[1]
 
     def _detect(self, image: NDArray[np.uint8], before: Pose | None) -> Detection:
-        """The body's markers, near where they were or else anywhere."""
+        """Find the body's markers, near their last places or else anywhere."""
         near = self._near(before) if before is not None else None
         if near is not None:
             detection = self._detector.detect_markers(image, *near)
@@ -128,14 +123,14 @@ class CameraSource:
         return self._detector.detect_markers(image)
 
     def _is_enough(self, detection: Detection) -> bool:
-        """Whether there is no need to look further."""
+        """Return whether there is no need to search further."""
         return (
             len(detection.ids) >= self.settings.minimum_markers
             or len(detection.chessboard_ids) >= 4
         )
 
     def _near(self, pose: Pose) -> tuple[tuple[int, int, int, int], int] | None:
-        """The window around the body as it was, and by how much to reduce the image there."""
+        """Return the window around the body's last place, and the reduction of the image there."""
         corners = self.camera.project_points(
             pose.transform_points(self.body.corners.reshape(-1, 3))
         )
@@ -157,7 +152,7 @@ class CameraSource:
     def _pose(
         self, image: NDArray[np.uint8], detection: Detection, before: Pose | None
     ) -> tuple[BodyPose, NDArray[np.float64]] | None:
-        """The pose and its covariance; see `measure_pose`."""
+        """Estimate the pose and its covariance; see `measure_pose`."""
         points, pixels, owners = detection.match_points(self.body)
         if not len(points):
             self.last_problem = self.last_problem or self._nothing(image, detection)
@@ -196,7 +191,7 @@ class CameraSource:
         return pose, self._ambiguity.record_choice(found, pose, before)
 
     def _unfit(self, pose: BodyPose, owners: NDArray[np.int64]) -> tuple[NDArray[np.int64], str]:
-        """Owners of points that cannot be used in a pose, and why."""
+        """Return the owners of points that cannot be used in a pose, and the reason."""
         markers = np.unique(owners)
         angles = self._view_angles(pose.pose, markers)
         steep = angles > VIEW_ANGLE_LIMIT
@@ -226,7 +221,7 @@ class CameraSource:
         return "the chessboard" if row < 0 else f"marker {self.body.ids[row]}"
 
     def _view_angles(self, pose: Pose, markers: NDArray[np.int64]) -> NDArray[np.float64]:
-        """rad, of each marker's normal to the line from it to the camera.
+        """Return the angles (rad) between the markers' normals and the lines to the camera.
 
         The chessboard (-1) counts as the last marker on it.
         """
@@ -244,20 +239,7 @@ class CameraSource:
         start = f"no marker of the body ({self.body.dictionary}) is in the image"
         if int(image.max()) <= _BLACK:
             return f"{start}, which is black: uncover the lens or add light"
-        others = self._others(image)
-        if not others:
-            return start
-        listed = ", ".join(str(number) for number in others[:5])
-        markers = format_count(len(others), "marker")
-        return f"{start}, only {markers} that the body lacks ({listed}): check the body's numbers"
-
-    def _others(self, image: NDArray[np.uint8]) -> list[int]:
-        """Numbers of the markers in the image that are the body's but for their numbers."""
-        parameters = cv2.aruco.DetectorParameters()
-        parameters.errorCorrectionRate = 0.0
-        known = load_dictionary(find_largest_dictionary(self.body.dictionary))
-        ids = cv2.aruco.ArucoDetector(known, parameters).detectMarkers(image)[1]
-        return [] if ids is None else np.unique(np.asarray(ids, dtype=np.int64)).tolist()
+        return start
 
 
 _PATIENCE_MS = 5000  # with a stream that is not there or sends nothing
@@ -295,7 +277,7 @@ class VideoSource:
             )
 
     def open(self) -> bool:
-        """Begin, or begin again, with the first image; whether there is something to begin with."""
+        """Begin, or begin again, with the first image; return whether there is one."""
         self.close()
         _hush()
         if self.name.isdigit():
@@ -326,16 +308,16 @@ class VideoSource:
 
     @property
     def interval(self) -> float:
-        """s between two images of a file."""
+        """Time (s) between two images of a file."""
         rate = self._rate
         if not rate and self._capture is not None:
             rate = float(self._capture.get(cv2.CAP_PROP_FPS))
         return 1.0 / (rate if 0.01 < rate < 1e4 else _USUAL_RATE)
 
     def grab_image(self) -> float | None:
-        """Wait for the next image; its age in s, or None where there is none any more.
+        """Wait for the next image; return its age in s, or None where there is none any more.
 
-        The age is 0 but for cameras under Linux, whose driver stamps what it reads.
+        The age is 0 but for cameras under Linux, whose driver stamps its images.
         """
         if self._capture is None or not self._capture.grab():
             return None
@@ -345,7 +327,7 @@ class VideoSource:
         return age if 0.0 < age < _OLDEST_S else 0.0
 
     def retrieve_image(self, *, grey: bool) -> NDArray[np.uint8] | None:
-        """The image that was grabbed, (rows, columns) or (rows, columns, 3) blue, green, red."""
+        """Return the grabbed image, (rows, columns) or (rows, columns, 3) blue, green, red."""
         if self._capture is None:
             return None
         ok, image = self._capture.retrieve()
@@ -361,7 +343,7 @@ class VideoSource:
 
 
 def _hush() -> None:
-    """Silence OpenCV and FFmpeg, as the caller says in a sentence when nothing is there."""
+    """Silence OpenCV and FFmpeg: the caller's sentence says that nothing is there."""
     # OpenCV 5 has moved it.
     set_level = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel
     set_level(_ERRORS_ONLY)
@@ -369,7 +351,7 @@ def _hush() -> None:
 
 
 def practise_tracking(body: RigidBody) -> bool:
-    """Track a drawn marker, or board, twice: from nowhere and from near. Whether it was found."""
+    """Track a drawn marker or board, from nowhere and from near; return whether it was found."""
     camera = CameraModel(640, 480, np.array([[600.0, 0, 319.5], [0, 600.0, 239.5], [0, 0, 1]]))
     image = np.full((480, 640), 255, dtype=np.uint8)
     if body.chessboard is not None:
@@ -380,6 +362,4 @@ def practise_tracking(body: RigidBody) -> bool:
         marker = cv2.aruco.generateImageMarker(load_dictionary(body.dictionary), number, 120)
         image[180:300, 260:380] = marker
     source = CameraSource(camera, body)
-    return [source.measure_pose(image, stamp) is not None for stamp in (0, 33_000_000)] == [
-        True
-    ] * 2
+    return all(source.measure_pose(image, stamp) for stamp in (0, 33_000_000))
