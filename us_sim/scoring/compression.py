@@ -174,7 +174,7 @@ class _Examination(Attempt):
         self._open: tuple[float, float] | None = None  # s since when, and m where it is seen open
         self._was_lifted = True  # since the last press
         self._along = np.nan  # m, of the last image
-        self._looked = -np.inf  # s, likewise
+        self._looked = -np.inf  # s, of the last image
         self._is_over = False  # whether the force is over its limit
         self._thrombus = np.inf, -np.inf  # m, from and to
         self.faults: list[Fault] = []

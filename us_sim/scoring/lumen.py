@@ -70,9 +70,9 @@ class LumenMeter:
     """Measures vessels image by image.
 
     Where the probe slides or tilts it sees other cross-sections, so each is compared with that of
-    the same plane at rest, from the skin on. An area at rest is NaN where no one can compare: a
-    vessel is hardly cut, reaches the image's edge, now or at rest, or vanishes from the image just
-    before or after it does so.
+    the same plane at rest, from the skin on. An area at rest is NaN where the two cannot be
+    compared: the plane hardly cuts the vessel, or the vessel reaches the image's edge, now or at
+    rest, or it vanishes right before or after a sample in which it does.
 
     Args:
         lumens: labels of each vessel by its name.

@@ -1,1 +1,1 @@
-"""Where the probe is: sources of poses, filters, calibration."""
+"""Sources of the probe's pose, filters, calibration."""

@@ -29,7 +29,7 @@ from us_sim.geometry.pose import Pose, multiply_quaternions
 from us_sim.geometry.se3 import rotation_exp
 
 _TURNS, _NEAR = 30, 1e-9
-"""How often the foot of a perpendicular is improved at most, and how far (m) it may then be off."""
+"""Most improvements of the foot of a perpendicular, and the error (m) that ends them."""
 _FACING_UP = 0.3
 """Cosine between -z and the normals of a closed surface's upper side, which is more than this."""
 _LEAST_FACING = 0.1
