@@ -35,7 +35,9 @@ def scanned(keys, clot=None, *, beside=False, artery=1.0, rate=5.0):
     if beside:
         part[:] = place = np.full(len(times), np.nan)
     count = len(times)
+    lifted = np.interp(times, ends, np.where(newtons > 0.0, 5e-4 * newtons, -5e-3))
     positions = LINE.points[0] + np.outer(np.nan_to_num(place), [0.0, 1.0, 0.0])
+    positions[:, 2] += lifted
 
     def section(part):
         middle = np.zeros(count)

@@ -23,7 +23,9 @@ def scan(left=(0.0, 0.0, 0.0), artery=(0.9, 0.9, 0.9), newtons=(6.0, 6.0, 6.0), 
     count = len(points) * len(PRESS)
     times = np.arange(float(count))
     along = np.repeat(points, len(PRESS))
-    motion = Motion(times, LINE.points[np.rint(1e3 * along).astype(int)], [[0, 0, 0, 1]] * count)
+    positions = LINE.points[np.rint(1e3 * along).astype(int)]
+    positions[:, 2] -= np.resize(np.where(PRESS > 0.0, 0.0, 5e-3), count)  # lifted between presses
+    motion = Motion(times, positions, [[0, 0, 0, 1]] * count)
 
     def section(least):
         area = 1e-5 * (1 - np.outer(1 - np.array(least), PRESS).ravel())
@@ -67,7 +69,7 @@ def with_lateral(lateral, along):
     section = scan().sections["vein"]
     count = len(section.times)
     made = replace(section, lateral=np.resize(lateral, count), along=np.resize(along, count))
-    return replace(scan(), sections={"vein": made, "artery": made})
+    return replace(scan(), sections={"vein": made, "artery": made}, force=None)
 
 
 def test_a_vessel_is_centred_as_long_as_it_is_in_the_middle():
@@ -76,6 +78,17 @@ def test_a_vessel_is_centred_as_long_as_it_is_in_the_middle():
     assert steps("centre", with_lateral(lateral, 0.0))[0].seen == "held for 4.0 s"
     assert done("centre", with_lateral(lateral, 0.0), duration=4.5) == [False]
     assert done("centre", replace(scan(), sections={})) == [False]
+    in_air_between = replace(with_lateral(lateral, 0.0), force=scan().force)
+    assert steps("centre", in_air_between)[0].seen == "held for 0.0 s, 2.0 s at most"
+
+
+def test_nothing_counts_before_a_hand_has_moved_the_probe_in_the_air():
+    times = np.linspace(0, 14, 1401)
+    late = replace(scan(), force=Force(times, np.where(times < 2.0, 0.0, 5.0)))
+    assert done("keep_force", late) == [True]
+    still = np.repeat(scan().motion.positions[:1], len(scan().motion), axis=0)
+    unmoved = replace(scan().motion, positions=still)
+    assert done("keep_force", replace(late, motion=unmoved)) == [False]
 
 
 def test_every_installed_exercise_can_be_read_and_is_of_a_scene_with_its_vessels():

@@ -3,12 +3,13 @@
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from us_sim.errors import ScoreError
-from us_sim.scoring.class_table import tabulate_results
+from us_sim.scoring.class_table import tabulate_results, write_class_table
 from us_sim.scoring.exercise import Step
 from us_sim.scoring.live import Score
 from us_sim.scoring.metrics import Metric
@@ -133,10 +134,16 @@ def test_results_that_a_place_refuses_are_kept_until_it_takes_them(tmp_path, mon
     assert not any((tmp_path / KEPT_FOLDER).iterdir())
 
 
-def test_the_table_of_a_class_has_a_row_for_each_attempt():
+def test_the_table_of_a_class_has_a_row_for_each_attempt(tmp_path):
     begun = [f"2026-11-29T07:0{k}:00+00:00" for k in range(3)]
     results = [result("Ada", begun[0], 1), result("Bob", begun[1], 3), result("Ada", begun[2], 3)]
     table = tabulate_results(results)
-    assert list(table["student"]) == ["Ada", "Bob", "Ada"]
-    assert list(table["right"]) == [1, 3, 3]
-    assert list(table["Highest force, N"]) == ["9.81"] * 3
+    csv, page = write_class_table(table, tmp_path / "out")
+    kept = pd.read_csv(csv)
+    assert list(kept["student"]) == ["Ada", "Bob", "Ada"]
+    assert list(kept["right"]) == [1, 3, 3]
+    assert list(kept["Highest force, N"]) == [9.81] * 3
+    text = page.read_text()
+    assert "2 students, 1 exercises, 3 attempts, 2 of them passed." in text
+    assert "Compression &lt;of&gt; the vein" in text
+    assert "data:image/png" in text

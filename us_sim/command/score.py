@@ -53,17 +53,14 @@ def _require_new(out: Path | None, files: Sequence[str]) -> None:
 
 
 def _score_class(args: argparse.Namespace) -> int:
-    from us_sim.scoring.class_table import tabulate_results
+    from us_sim.scoring.class_table import CLASS_FILES, tabulate_results, write_class_table
     from us_sim.scoring.result_place import read_results
 
-    out: Path | None = args.out
-    _require_new(out, ["class.csv"])
+    _require_new(args.out, CLASS_FILES)
     table = tabulate_results(read_results(args.of_class))
     print(table.drop(columns=["volume", "changed", "checksum"]).to_string(index=False))
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        table.to_csv(out / "class.csv", index=False)
-        print(out / "class.csv")
+    for file in write_class_table(table, args.out) if args.out is not None else []:
+        print(file)
     return 0
 
 

@@ -76,7 +76,7 @@ class Scorer(SceneNode):
         self._title = self._exercise.name if self._exercise is not None else self.scene.name
         results = self._settings.results
         self._place = ResultPlace(results) if results else None
-        self._void = ""
+        self._void, self._is_known = "", False  # whether a result has told of this arm
         if self._settings.begun:
             self._void = "the scorer was started again: begin anew"
         self._begin_attempt()
@@ -192,6 +192,7 @@ class Scorer(SceneNode):
             "volume": self.scene.volume.name,
             "method": tissue.solver if tissue is not None else "none",
             "changed": "; ".join(self._changes),
+            "arm": "known from an attempt before" if self._is_known else "",
             "us_sim": __version__,
         }
         plain = select_plain_metrics(score, self._limits.force_limit)
@@ -208,8 +209,13 @@ class Scorer(SceneNode):
             "plain": {each.label: each.brief for each in plain},
             "steps": [step.to_document() for step in score.steps],
             "faults": faults,
-            "metrics": {each.label: each.text for each in score.metrics},
+            "metrics": {} if self._is_hidden(score) else {m.label: m.text for m in score.metrics},
         }
+
+    def _is_hidden(self, score: Score) -> bool:
+        """Return whether the result would tell the truth before the learner has answered."""
+        exercise = self._exercise
+        return exercise is not None and exercise.feedback == "afterwards" and not score.has_ended
 
     def _keep_result(self, score: Score | None, *, is_last: bool = False) -> None:
         """Draw and write the result once the attempt has ended, or shall go on no more."""
@@ -251,11 +257,16 @@ class Scorer(SceneNode):
         score, scan = self._live.compute_score(), self._live.build_scan()
         if score is None or scan is None:
             return "nothing was done yet"
+        if self._is_hidden(score):
+            return "the result is told once all is answered"
         self._publish_picture(self._draw_score(scan, score.steps))
         return ""
 
     def _clear(self) -> str:
-        self._keep_result(self._live.compute_score(), is_last=True)
+        score = self._live.compute_score()
+        self._keep_result(score, is_last=True)
+        asks = self._exercise is not None and self._exercise.feedback == "afterwards"
+        self._is_known |= asks and score is not None and score.has_ended
         self._live.clear()
         self._live_settings.restore_settings(
             {OWN: replace(self._settings, answers=(), thrombus="")}

@@ -1,15 +1,24 @@
-"""The table of a class: all results that were written to one place."""
+"""The table of a class: all results that were written to one place, and a picture of them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from html import escape
+from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from us_sim.scoring.result import encode_picture
+
+CLASS_FILES = ("class.csv", "class.html")
+_NOBODY = "somebody"
+_ALT = "Points right of each attempt, over time, for each student"
+
 
 def tabulate_results(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Return one row for each result: student, exercise, begin, state, and plain metrics.
+    """Return one row for each result: who, what, when, what became of it, and plain metrics.
 
     Args:
         results: documents, by the time of their begin.
@@ -20,11 +29,11 @@ def tabulate_results(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         right = sum(step["state"] == "done" for step in steps)
         rows.append(
             {
-                "student": about.get("student") or "somebody",
+                "student": about.get("student") or _NOBODY,
                 "exercise": result["name"],
                 "begun": about["begun"],
                 "result": result["state"],
-                **dict([*result["plain"].items()][:-1]),  # the last is right and of
+                **dict([*result["plain"].items()][:-1]),  # the last is told in two columns
                 "right": right,
                 "of": len(steps),
                 "faults": len(result["faults"]),
@@ -34,3 +43,54 @@ def tabulate_results(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
             }
         )
     return pd.DataFrame(rows)
+
+
+def write_class_table(table: pd.DataFrame, folder: Path) -> list[Path]:
+    """Write the table as CSV, and as a page with a picture; return the files."""
+    files = [folder / name for name in CLASS_FILES]
+    folder.mkdir(parents=True, exist_ok=True)
+    table.to_csv(files[0], index=False)
+    shown = table.drop(columns=["volume", "checksum"]).fillna("-")
+    files[1].write_text(
+        '<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>Class</title>'
+        "<style>body {font-family: sans-serif; margin: 2em} td, th {padding: 0.2em 0.8em; "
+        "text-align: left} img {max-width: 100%}</style><h1>Class</h1>"
+        f'<p>{escape(_summary(table))}</p><img src="{encode_picture(_draw(table))}" alt="{_ALT}">'
+        f"{shown.to_html(index=False, border=0)}</html>",
+        encoding="utf-8",
+    )
+    return files
+
+
+def _summary(table: pd.DataFrame) -> str:
+    passed = table[table["result"] == "passed"]
+    return (
+        f"{table['student'].nunique()} students, {table['exercise'].nunique()} exercises, "
+        f"{len(table)} attempts, {len(passed)} of them passed."
+    )
+
+
+def _draw(table: pd.DataFrame) -> bytes:
+    """Draw the part of the points that is right over time: a row for each exercise."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    exercises = list(dict.fromkeys(table["exercise"]))
+    figure = Figure(figsize=(9, 1.0 + 1.8 * len(exercises)), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(len(exercises), 1, sharex=True, squeeze=False)
+    times = pd.to_datetime(table["begun"], utc=True)
+    students = {name: f"C{k % 10}" for k, name in enumerate(sorted(table["student"].unique()))}
+    for axes, exercise in zip(grid[:, 0], exercises, strict=True):
+        for student, colour in students.items():
+            mine = table[(table["exercise"] == exercise) & (table["student"] == student)]
+            part = 100 * mine["right"] / mine["of"].clip(lower=1)
+            axes.plot(times[mine.index], part, "o-", color=colour, label=student)
+        axes.set(title=exercise, ylabel="right, %", ylim=(-5, 105))
+        axes.grid(True, color="0.93")
+        axes.spines[["top", "right"]].set_visible(False)
+    grid[0, 0].legend(fontsize=8, frameon=False)
+    figure.autofmt_xdate()
+    drawn = BytesIO()
+    figure.savefig(drawn, format="png")
+    return drawn.getvalue()

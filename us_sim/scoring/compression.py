@@ -29,6 +29,7 @@ _OPEN = 0.5  # part of its area at rest from which a vessel counts as open
 _ENOUGH = 10.0  # N, after which a vein that is still open holds a thrombus
 _LOOKED = 0.3  # s, for which a person must see a vein open, or closed, to be sure of it
 _LIGHT = 3.0  # N, below which a probe lies on the skin and does not press
+_TURN = np.deg2rad(20.0)  # by which a press may turn
 _EDGE = 3e-3  # m from a thrombus' end, within which both answers are right
 _MM = 1e3
 
@@ -108,6 +109,8 @@ class _Look(NamedTuple):
     force: float  # N; NaN without force
     peak: float  # N, the most since the image before
     artery: float  # part of the artery's area at rest; 1 where nobody knows
+    place: NDArray[np.float64]  # (3,) m, of the probe
+    orientation: NDArray[np.float64]  # (4,) quaternion of it, of length 1
 
     @property
     def is_touching(self) -> bool:
@@ -136,7 +139,7 @@ class _Point:
 class _Press:
     """A press, until the probe lies on the skin lightly again, with the vein open."""
 
-    along: float  # m, where it began
+    begin: _Look
     problem: str = ""  # why it does not count
     has_slid: bool = False
     least: float = np.inf  # part that was open at least
@@ -211,6 +214,8 @@ class _Examination(Attempt):
             if scan.force
             else np.full(len(section.times), np.nan)
         )
+        places = scan.motion.interpolate_positions(section.times)
+        orientations = scan.motion.find_orientations(section.times)
         for k in np.flatnonzero(section.times > scan.since).tolist():
             time, peak = float(section.times[k]), float(force[k])
             if self.ended is not None and time > self.ended:
@@ -221,7 +226,11 @@ class _Examination(Attempt):
                 peak = float(between.max(initial=np.nan_to_num(peak)))
             part_of_artery = 1.0 if artery is None else np.nan_to_num(artery.fraction[k], nan=1.0)
             along, part = float(section.along[k]), float(section.fraction[k])
-            self._look(_Look(time, along, part, float(force[k]), peak, float(part_of_artery)))
+            place, orientation = places[k], orientations[k]
+            artery_part = float(part_of_artery)
+            self._look(
+                _Look(time, along, part, float(force[k]), peak, artery_part, place, orientation)
+            )
             self._looked = time
 
     def list_steps(self) -> list[Step]:
@@ -233,8 +242,8 @@ class _Examination(Attempt):
             if self.is_blind:
                 steps.append(self._hidden_step(f"point {number}", point))
                 continue
-            seen = self._describe_press() if point is pressed and not point.is_done else point.seen
             is_here = abs(self._along - point.at) <= _TOLERANCE
+            seen = point.seen if point.is_done else self._describe_point(point, point is pressed)
             is_missed = point.most is not None and not (point.is_done or is_here)
             steps.append(Step(what, point.is_done, seen, point.place[None], is_missed=is_missed))
         if self.is_blind:
@@ -243,14 +252,15 @@ class _Examination(Attempt):
 
     def _hidden_step(self, what: str, point: _Point) -> Step:
         """Return the step of a point on which the learner answers."""
-        pressed = "not pressed" if point.most is None else f"pressed with {point.most:.1f} N"
+        most = self._press.most if self._press and self._find_pressed() is point else point.most
+        pressed = "not pressed" if most is None else f"pressed with {most:.1f} N"
         seen = f"{pressed}, {point.answer or 'no answer yet'}"
         if self.ended is None:
             return Step(what, False, seen, point.place[None])
         truths = self._truths(point)
         is_right = point.answer in truths and point.is_examined
         if point.answer not in truths:
-            seen = f"{seen}: it is {truths[0]}"
+            seen = f"{seen}: it is {' or '.join(truths)}"
         elif not is_right:
             seen = f"{seen}: right, and not examined: {point.seen}"
         return Step(what, is_right, seen, point.place[None], is_missed=not is_right)
@@ -279,8 +289,13 @@ class _Examination(Attempt):
         if limit is None:
             return []
         seconds = self.compute_duration() or 0.0
-        is_kept = seconds <= limit
-        return [Step(f"within {limit:g} s", is_kept, f"{seconds:.0f} s", is_missed=not is_kept)]
+        is_kept, is_over = seconds <= limit, self.ended is not None
+        is_missed = is_over and not is_kept
+        return [
+            Step(
+                f"within {limit:g} s", is_over and is_kept, f"{seconds:.0f} s", is_missed=is_missed
+            )
+        ]
 
     def _look(self, look: _Look) -> None:
         task = self._task
@@ -290,7 +305,7 @@ class _Examination(Attempt):
             return
         self._along = look.along if np.isfinite(look.along) else self._along
         if self._press is None and look.is_pressing:
-            self._press = _Press(look.along, self._explain_early(look))
+            self._press = _Press(look, self._explain_early(look))
         if self._press is not None:
             self._press.add_look(look)
             self._check_place(look, self._press)
@@ -315,19 +330,33 @@ class _Examination(Attempt):
         """Return why a press that begins does not count; "" if it does so far."""
         if self._task.lift_between and not self._was_lifted:
             return "pressed again without a lift: lift the probe between two presses"
-        if self._open is not None:
-            since, along = self._open
-            is_there = abs(look.along - along) <= _TOLERANCE
-            if is_there and self._looked - since >= _LOOKED:
-                return ""
+        if self._is_seen_open(look.along):
+            return ""
         return "pressed before the vein was seen open there: touch lightly first"
 
+    def _is_seen_open(self, along: float) -> bool:
+        """Return whether the vein has been seen open there for long enough."""
+        if self._open is None:
+            return False
+        since, where = self._open
+        return abs(along - where) <= _TOLERANCE and self._looked - since >= _LOOKED
+
     def _check_place(self, look: _Look, press: _Press) -> None:
-        slid = abs(look.along - press.along)
-        if look.is_touching and slid > _TOLERANCE and not press.has_slid:
-            press.has_slid = True
-            press.problem = f"slid {_MM * slid:.0f} mm under pressure: let go before you slide on"
-            self.faults.append(Fault(look.time, press.problem))
+        """Void a press that slides over the skin or turns."""
+        begin = press.begin
+        moved = _to_axes(look.place - begin.place, begin.orientation)
+        slid = float(np.hypot(moved[0], moved[1]))
+        turned = 2.0 * np.arccos(min(abs(float(look.orientation @ begin.orientation)), 1.0))
+        if press.has_slid or not look.is_touching or (slid <= _TOLERANCE and turned <= _TURN):
+            return
+        press.has_slid = True
+        how = (
+            f"slid {_MM * slid:.0f} mm"
+            if slid > _TOLERANCE
+            else f"turned {np.rad2deg(turned):.0f}°"
+        )
+        press.problem = f"{how} under pressure: let go before you move on"
+        self.faults.append(Fault(look.time, press.problem))
 
     def _check_force(self, look: _Look) -> None:
         limit = self._task.force_limit
@@ -344,7 +373,7 @@ class _Examination(Attempt):
         """Return the point that the press is at."""
         if self._press is None:
             return None
-        along = self._press.along
+        along = self._press.begin.along
         nearest = min(self._points, key=lambda point: abs(point.at - along))
         return nearest if abs(nearest.at - along) <= _TOLERANCE else None
 
@@ -381,16 +410,29 @@ class _Examination(Attempt):
         is_thrombus = begin - _TOLERANCE <= point.at <= end + _TOLERANCE
         return is_thrombus, f"{seen}: {'a thrombus' if is_thrombus else 'not closed'}"
 
-    def _describe_press(self) -> str:
+    def _describe_point(self, point: _Point, is_pressed: bool) -> str:
+        """Return words for a point that is to be done: what goes on there, or was seen."""
+        press, is_here = self._press, abs(self._along - point.at) <= _TOLERANCE
+        if press is not None and (is_pressed or (is_here and press.problem)):
+            return press.problem or self._describe_press(press)
+        if press is None and is_here and self._is_seen_open(self._along):
+            return "seen open: press"
+        return point.seen
+
+    @staticmethod
+    def _describe_press(press: _Press) -> str:
         """Return words for the press that goes on."""
-        press = self._press
-        assert press is not None
-        if press.problem:
-            return press.problem
         if press.closed is not None:
             return f"closed{_format_force(press.closed[0])}: let go"
         seen = f"{100 * press.least:.0f} % open{_format_force(press.force)}"
         return f"{seen}: {'press harder' if press.most < _ENOUGH else 'let go'}"
+
+
+def _to_axes(vector: NDArray[np.float64], orientation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a vector (3,) of frame ``patient`` along the axes of a probe."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_quat(orientation).inv().apply(vector))
 
 
 def _format_force(force: float) -> str:

@@ -34,6 +34,7 @@ from us_sim.share import shared_roots
 
 _TIME, _FORCE = Quantity("time", 0.1, 3600.0), Quantity("force", 0.01, 200.0)
 _MM = 1e3
+_MOVED = 1e-3  # m, by which a hand has moved the probe
 
 
 class Step(NamedTuple):
@@ -64,37 +65,63 @@ class Fault(NamedTuple):
 class Attempt(ABC):
     """An attempt at a task: a scan is added to it whole, or in pieces one after another.
 
-    It begins when the probe is in the air for the first time: a scene may be loaded, or an attempt
-    begun anew, under a probe that presses already. A scan without force begins at once, since
-    nobody knows when it touches.
+    It begins when a hand moves the probe in the air for the first time: a scene may be loaded, or
+    an attempt begun anew, under a probe that presses already. A scan without force begins at once,
+    since nobody knows when it touches.
     """
 
-    was_in_air = False
     is_blind = False
-    """Until the attempt has ended, steps say nothing that an image does not show."""
+    """Whether steps say nothing that an image does not show, until the attempt has ended."""
     touched: float | None = None
-    """s since the first pose, of the probe's first touch; None before."""
+    """s since the first pose, when the probe touched the skin for the first time."""
     ended: float | None = None
-    """s since the first pose, of the end: all was done, or the time was over; None before."""
+    """s, when all was done or the time was over; None before."""
     faults: Sequence[Fault] = ()
-    """In the order of their times."""
+    """What was done wrong, in order."""
+    _has_begun = False
+    _air: tuple[float, NDArray[np.float64]] | None = None
+    """s and (3,) m: since when, and from where, the probe is in the air."""
     _time = 0.0  # s, of the last pose
 
-    def add_scan(self, scan: Scan) -> None:
-        """Add the samples that are new, from the first in the air on."""
+    @property
+    def was_in_air(self) -> bool:
+        """Whether the attempt has begun, or does so once the hand moves the probe."""
+        return self._has_begun or self._air is not None
+
+    def add_scan(self, scan: Scan) -> Scan | None:
+        """Add the samples that are new; return those that count, None before the begin."""
         times, is_touching = scan.motion.times, np.ones(len(scan.motion), bool)
         if scan.force is not None:
             times, is_touching = scan.force.times, scan.force.newtons >= CONTACT_FORCE
-            in_air = times[(times > scan.since) & ~is_touching]
-            if not self.was_in_air:
-                if not len(in_air):
-                    return
-                scan = replace(scan, since=float(np.nextafter(in_air[0], -np.inf)))
-        self.was_in_air, self._time = True, float(scan.motion.times[-1])
+            if not self._has_begun:
+                begin = self._find_begin(scan, times, is_touching)
+                if begin is None:
+                    return None
+                scan = replace(scan, since=max(scan.since, float(np.nextafter(begin, -np.inf))))
+        self._has_begun, self._time = True, float(scan.motion.times[-1])
         if self.touched is None:
             touching = times[(times > scan.since) & is_touching]
             self.touched = float(touching[0]) if len(touching) else None
         self.add_samples(scan)
+        return scan
+
+    def _find_begin(
+        self, scan: Scan, times: NDArray[np.float64], is_touching: NDArray[np.bool_]
+    ) -> float | None:
+        """Return since when the probe was in the air from where a hand has moved it.
+
+        A force that comes without a motion is a simulation that has just started, and no touch.
+        """
+        new = times > scan.since
+        places = scan.motion.interpolate_positions(times[new])
+        for time, place, touches in zip(times[new].tolist(), places, is_touching[new], strict=True):
+            if self._air is not None and np.linalg.norm(place - self._air[1]) >= _MOVED:
+                return self._air[0]
+            if touches:
+                self._air = None
+            elif self._air is None:
+                self._air = time, place
+        return None
 
     @abstractmethod
     def add_samples(self, scan: Scan) -> None:
@@ -197,7 +224,7 @@ class _KeptForce(_Holding):
         task = self._task
         what = f"{task.force:g} ± {task.tolerance:g} N for {task.duration:g} s"
         if self._newtons is None:
-            return [Step(what, False, "the recording has no force")]
+            return [Step(what, False, "no force yet")]
         step = self._step(what)
         now = "" if step.is_done else f"{self._newtons:.1f} N now; "
         return [step._replace(seen=now + step.seen)]
@@ -234,6 +261,9 @@ class _Centred(_Holding):
             new = section.times > scan.since
             self._is_seen |= bool(np.isfinite(section.fraction[new]).any())
             within = np.abs(section.lateral[new]) <= self._task.offset
+            if scan.force is not None:
+                newtons = np.interp(section.times[new], scan.force.times, scan.force.newtons)
+                within &= newtons >= CONTACT_FORCE
             self._hold(section.times[new], within)
 
     def list_steps(self) -> list[Step]:

@@ -150,9 +150,15 @@ class LiveScan:
         metrics = list(tally.list_metrics())
         if attempt is None:
             return Score(metrics)
-        seconds, has_ended = attempt.compute_duration(), attempt.ended is not None
-        was_in_air = attempt.was_in_air
-        return Score(metrics, attempt.list_steps(), attempt.faults, seconds, has_ended, was_in_air)
+        begin = attempt.touched or 0.0
+        return Score(
+            metrics,
+            attempt.list_steps(),
+            [fault._replace(time=fault.time - begin) for fault in attempt.faults],
+            attempt.compute_duration(),
+            attempt.ended is not None,
+            attempt.was_in_air,
+        )
 
     def _settle(self) -> None:
         """Add what later samples cannot change any more."""
@@ -190,6 +196,6 @@ def _span(times: list[float], since: float, until: float) -> tuple[int, int]:
 
 
 def _add(tally: Tally, attempt: Attempt | None, scan: Scan) -> None:
-    tally.add_scan(scan)
-    if attempt is not None:
-        attempt.add_scan(scan)
+    counted = scan if attempt is None else attempt.add_scan(scan)
+    if counted is not None:
+        tally.add_scan(counted)

@@ -56,6 +56,16 @@ class Motion:
     def __len__(self) -> int:
         return len(self.times)
 
+    def interpolate_positions(self, times: _Array) -> _Array:
+        """Return the positions (N, 3) m at times (N,) s; beyond the ends those of the ends."""
+        axes = [np.interp(times, self.times, axis) for axis in self.positions.T]
+        return np.stack(axes, axis=1)
+
+    def find_orientations(self, times: _Array) -> _Array:
+        """Return the orientations (N, 4) of the last samples before times (N,) s."""
+        last = np.searchsorted(self.times, times, side="right") - 1
+        return np.asarray(self.orientations[np.maximum(last, 0)])
+
     @cached_property
     def steps(self) -> _Array:
         """(K-1,) s."""
