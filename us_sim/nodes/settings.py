@@ -19,7 +19,7 @@ from us_sim.scoring.settings import ScoreSettings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import FILTERS, SOLVERS, TRACKERS
 from us_sim.settings.setting import (
-    RefusedValue,
+    RefusedValueError,
     Settings,
     convert_value,
     kinds_of,
@@ -540,7 +540,7 @@ def _checked(
     kind = kinds_of(settings)[field]
     try:
         made = convert_value(kind, to_setting_value(kind, value), rules_of(settings)[field])
-    except RefusedValue as refusal:
+    except RefusedValueError as refusal:
         raise UsSimError(f"{option}: {refusal}") from refusal
     return to_parameter_value(kind, made)
 

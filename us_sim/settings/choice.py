@@ -35,7 +35,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Option:
-    """Where one option is, as ``module:name``."""
+    """Place of one option's class, as ``module:name``."""
 
     target: str  # its class
     settings: str | None = None  # its settings; not given, its class's attribute ``Settings``
@@ -60,7 +60,7 @@ class Option:
         return getattr(self.load(), "__doc__", None)
 
     def load_settings(self) -> type[Settings]:
-        """Import the settings."""
+        """Import the settings class: the named one, or else the class's attribute ``Settings``."""
         if self.settings is not None:
             found: type[Settings] = self._import(self.settings)
             return found
@@ -88,13 +88,13 @@ class Choice:
     """The options of one kind.
 
     Args:
-        what: they are, for a person: ``tissue solver``.
-        key: under which a file names the one it wants.
-        group: entry points under which other packages add theirs; they may not replace ours.
-        error: raised for a name that there is not.
-        needs: whether options have settings without which they cannot be.
-        described: whether an option's class may say in ``in_short`` what it is good for.
-        options: by name, where each is.
+        what: noun for the options, for a person: ``tissue solver``.
+        key: key under which a file names its option.
+        group: entry point group of other packages' options; they may not replace ours.
+        error: class of the error for an unknown name.
+        needs: whether options have required settings.
+        described: whether an option's class may describe itself in ``in_short``.
+        options: each option, or its class as ``module:name``, by name.
     """
 
     def __init__(
@@ -151,29 +151,21 @@ class Choice:
         return tuple(name for name, option in self.options.items() if option not in self._broken)
 
     def get_option(self, name: str) -> Option:
-        """Where the option of that name is.
+        """Return the option of that name.
 
         Raises:
-            SettingsError: or the choice's own error: there is none; the sentence says which are.
+            SettingsError: or the choice's own error: there is none; the sentence lists the names.
         """
         if name not in self.options:
             raise self._error(f"{self.what} {describe_unknown(name, self.names)}")
         return self.options[name]
 
     def load(self, name: str) -> Any:
-        """The class of that name, imported now.
-
-        Raises:
-            SettingsError: see `get_option`.
-        """
+        """Import the class of that name; an unknown name is refused as by `get_option`."""
         return self.get_option(name).load()
 
     def load_settings(self, name: str) -> type[Settings]:
-        """The settings class of that name, imported now.
-
-        Raises:
-            SettingsError: see `get_option`.
-        """
+        """Import the settings class of that name; an unknown name is refused as by `get_option`."""
         return self.get_option(name).load_settings()
 
     @property
@@ -196,5 +188,5 @@ class ChosenOption:
     given: Settings | None = None
 
     def resolve_settings(self, choice: Choice) -> Any:
-        """The settings that were given, or those that it has by default."""
+        """Return the settings that were given, or the option's defaults."""
         return self.given if self.given is not None else choice.load_settings(self.name)()

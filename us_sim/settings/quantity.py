@@ -1,10 +1,10 @@
 """Numbers with units: read as a person writes them in a scene, and shown in handy units.
 
->>> from us_sim.settings.quantity import Quantity, format_quantity, choose_dial_unit, format_range
+>>> from us_sim.settings.quantity import Quantity, choose_dial_unit, format_quantity, format_range
 >>> Quantity("length", minimum=0.0, maximum=1.0).parse("40 mm")
 0.04
->>> format_quantity(0.0003, "length"), format_quantity(12e3, "pressure"), format_quantity(2.0, "number")
-('0.3 mm', '12 kPa', '2')
+>>> format_quantity(0.0003, "length"), format_quantity(12e3, "pressure")
+('0.3 mm', '12 kPa')
 >>> format_range(Quantity("length", 0.003, 0.2)), format_range(Quantity("level", -60.0, 0.0))
 ('3 to 200 mm', '-60 to 0 dB')
 >>> choose_dial_unit(Quantity("frequency", 5e5, 5e7)), choose_dial_unit(Quantity("rate", 0.02, 5.0))
@@ -48,10 +48,7 @@ _NUMBER = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s
 
 
 def units_of(unit: str) -> dict[str, float]:
-    """Units that measure the same as an SI unit, each with how many of the SI unit it is.
-
-    There are none for a text that is no SI unit here.
-    """
+    """Return the units of an SI unit's dimension, with their sizes in it; none for other texts."""
     same: dict[str, float] = {}
     for units in _UNITS.values():
         if next(iter(units), None) == unit:
@@ -73,7 +70,7 @@ class Quantity:
         return next(iter(_UNITS[self.dimension]), "")
 
     def parse(self, value: object) -> float:
-        """The value in SI units.
+        """Convert a value to SI units.
 
         Raises:
             ValueError: not a number, a unit of another dimension, not finite, or out of range.
@@ -111,7 +108,7 @@ class Quantity:
         return f"{self.minimum:g} to {self.maximum:g}{unit}"
 
     def _describe_misfit(self, value: object) -> str:
-        """That a value is none of this dimension in one of the units that can be written."""
+        """Say what a value should have been: the dimension and its units."""
         article = "an" if self.dimension[0] in "aeiou" else "a"
         units = list(_UNITS[self.dimension])
         if units:
@@ -121,7 +118,7 @@ class Quantity:
         return f"{short_repr(value)} is not {article} {self.dimension}{hint}"
 
     def _suggest_unit(self, number: float) -> str:
-        """A likely unit slip: the unit with which the number is most in the middle of the range."""
+        """Suggest the unit that brings the number nearest to mid-range; "" if none does."""
         meant = {
             unit: number * factor
             for unit, factor in _UNITS[self.dimension].items()
@@ -154,13 +151,13 @@ _EXACT = 1e-12
 
 
 def format_quantity(value: float, dimension: str) -> str:
-    """The number with its unit, as `Quantity.parse` reads it."""
+    """Write a number with its unit, so that `Quantity.parse` reads it."""
     number, unit = _choose_unit(value, dimension)
     return f"{number} {unit}" if unit else number
 
 
 def format_range(quantity: Quantity) -> str:
-    """The range of a quantity, with its unit once where both ends have the same."""
+    """Write the range of a quantity, with its unit once where both ends have the same."""
     low, low_unit = _choose_unit(quantity.minimum, quantity.dimension)
     high, high_unit = _choose_unit(quantity.maximum, quantity.dimension)
     if quantity.minimum == 0.0:
@@ -173,7 +170,7 @@ def format_range(quantity: Quantity) -> str:
 
 
 def choose_dial_unit(quantity: Quantity) -> str:
-    """The one unit in which all of a quantity's range is shown where a person turns it."""
+    """Choose the one unit in which a control shows all of a quantity's range."""
     dimension = quantity.dimension
     if dimension == "frequency" and quantity.minimum >= 1e5:  # of sound
         return "MHz"
@@ -186,7 +183,7 @@ def choose_dial_unit(quantity: Quantity) -> str:
 
 
 def _choose_unit(value: float, dimension: str) -> tuple[str, str]:
-    """The number and the unit that read best of those that say the value exactly."""
+    """Return the number and the unit that read best among those that state the value exactly."""
     si = Quantity(dimension).unit
     if value == 0.0:
         return "0", _HANDY.get(dimension, (si,))[0]
@@ -206,7 +203,7 @@ def _choose_unit(value: float, dimension: str) -> tuple[str, str]:
 
 
 def _in_unit(value: float, dimension: str, unit: str) -> str | None:
-    """The number in that unit with at most six digits, if that is it."""
+    """Write the number in that unit with at most six digits; None where these are not exact."""
     text = f"{value / Quantity(dimension).parse(f'1 {unit}'):.6g}"
     back = Quantity(dimension).parse(f"{text} {unit}")
     return _tidy(text) if math.isclose(back, value, rel_tol=_EXACT) else None

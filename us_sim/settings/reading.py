@@ -2,10 +2,11 @@
 
 >>> from us_sim.settings.reading import SettingsReader, dump_settings
 >>> from us_sim.skin.settings import SkinSettings
->>> skin = SettingsReader("my.yaml").read(SkinSettings, {"spacing": "5 mm", "size": ["12 cm", "10 cm"]})
+>>> reader = SettingsReader("my.yaml")
+>>> skin = reader.read(SkinSettings, {"spacing": "5 mm", "size": ["12 cm", "10 cm"]})
 >>> dump_settings(skin)
 {'size': [0.12, 0.1], 'spacing': 0.005}
->>> SettingsReader("my.yaml").read(SkinSettings, {"spacign": "5 mm"}, "skin")
+>>> reader.read(SkinSettings, {"spacign": "5 mm"}, "skin")
 Traceback (most recent call last):
 ...
 us_sim.errors.SettingsError: my.yaml: skin.spacign: unknown key; did you mean `spacing`?
@@ -20,7 +21,7 @@ from typing import Any, TypeVar, get_args, get_origin
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.settings.choice import Choice, ChosenOption
 from us_sim.settings.setting import (
-    RefusedValue,
+    RefusedValueError,
     SettingRule,
     Settings,
     convert_value,
@@ -36,10 +37,10 @@ class SettingsReader:
     """Reads settings from one document.
 
     Args:
-        origin: the document, for sentences: a file's path.
-        find_file: from the text of a setting that names a file, and that setting's path of keys,
-            to the text to keep; it raises ``error`` where there is no such file.
-        error: what is raised.
+        origin: name of the document in error sentences, such as a file's path.
+        find_file: called with the text of a setting that names a file and its path of keys;
+            returns the text to keep, or raises ``error`` where there is no such file.
+        error: class of the errors.
     """
 
     def __init__(
@@ -53,9 +54,10 @@ class SettingsReader:
         self._error = error
 
     def read(self, settings: type[S], document: object, path: str = "") -> S:
-        """An instance of ``settings`` from a mapping.
+        """Make an instance of ``settings`` from a mapping.
 
         Args:
+            settings: their class.
             document: the mapping, as YAML or JSON gives it.
             path: the keys that lead to it, with dots.
 
@@ -106,7 +108,7 @@ class SettingsReader:
             return tuple(self.read(listed, each, f"{path}[{i}]") for i, each in enumerate(value))
         try:
             made = convert_value(kind, value, rule, lambda k, v, r: self._read_other(k, v, r, path))
-        except RefusedValue as refusal:
+        except RefusedValueError as refusal:
             raise self._make_error(f"{path}{refusal.key}", refusal.problem) from refusal
         for key, text in _iter_texts(made):
             if not text.strip():
@@ -134,7 +136,7 @@ class SettingsReader:
         return value
 
     def _read_chosen(self, choice: Choice, document: object, path: str) -> ChosenOption:
-        """The option named under the choice's key, with the other keys as its settings."""
+        """Read the option named under the choice's key, with the other keys as its settings."""
         mapping = self._require_mapping(document, path)
         if choice.key not in mapping:
             for key in mapping:
@@ -156,11 +158,10 @@ class SettingsReader:
         path: str,
         beside: set[str],
     ) -> tuple[set[str], ChosenOption]:
-        """The option chosen among the keys of other settings, and the keys that are about it."""
+        """Return the keys of an option chosen among the keys of other settings, and the option."""
         choice = rule.choice
         assert choice is not None
-        default = settings.__dataclass_fields__[field].default  # type: ignore[attr-defined]
-        name = default.name
+        name = settings.__dataclass_fields__[field].default.name  # type: ignore[attr-defined]
         if choice.key in mapping:
             name = self._require_name(choice, mapping[choice.key], join_keys(path, choice.key))
         if rule.place == "named":
@@ -172,9 +173,10 @@ class SettingsReader:
                     raise self._make_error(
                         join_keys(path, other), f"is for {choice.key} {other} only, not {name}"
                     )
-            own = mapping.get(name)
-            made = None if name not in mapping else self._read_settings(choice, name, own, path)
-            return {choice.key, name}, ChosenOption(name, made)
+            own = None
+            if name in mapping:
+                own = self._read_settings(choice, name, mapping[name], path)
+            return {choice.key, name}, ChosenOption(name, own)
         rest = {k: v for k, v in mapping.items() if k not in beside and k != choice.key}
         return {choice.key, *rest}, ChosenOption(
             name, self._read_option_settings(choice, name, rest, path, beside)
@@ -191,7 +193,7 @@ class SettingsReader:
         path: str,
         beside: Collection[str] = (),
     ) -> Settings | None:
-        """The settings of an option, whose keys say of which option they are."""
+        """Read the settings of an option; an error at a key names the option."""
         kind = f"{name} {choice.what}"
         article = "an" if kind[0] in "aeiou" and not kind.startswith("one") else "a"
         if not (mapping or choice.needs):
@@ -258,7 +260,7 @@ def _iter_texts(value: object) -> Iterator[tuple[str, str]]:
 
 
 def join_keys(path: str, key: str) -> str:
-    """A path of keys, one key longer."""
+    """Append a key to a path of keys."""
     return f"{path}.{key}" if path and key else path or key
 
 
@@ -268,11 +270,10 @@ def _is_required(settings: type, name: str) -> bool:
 
 
 def dump_settings(settings: Settings) -> dict[str, Any]:
-    """The settings that differ from their defaults, in SI units."""
+    """Return the settings that differ from their defaults, in SI units."""
     document: dict[str, Any] = {}
-    fields = {field.name: field for field in dataclasses.fields(settings)}
     for name, rule in rules_of(type(settings)).items():
-        value, field = getattr(settings, name), fields[name]
+        value, field = getattr(settings, name), type(settings).__dataclass_fields__[name]
         by_default = field.default
         if field.default_factory is not dataclasses.MISSING:
             by_default = field.default_factory()
@@ -286,7 +287,7 @@ def dump_settings(settings: Settings) -> dict[str, Any]:
 
 
 def _dump_chosen(name: str, chosen: ChosenOption, rule: SettingRule) -> dict[str, Any]:
-    """The keys of the chosen option, at the place that its rule states."""
+    """Return the keys of the chosen option, at the place that its rule states."""
     assert rule.choice is not None
     own = dump_settings(chosen.given) if chosen.given is not None else {}
     key = {rule.choice.key: chosen.name}

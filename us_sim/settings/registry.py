@@ -69,13 +69,9 @@ FILTERS = Choice(
     key="method",
     error=TrackingError,
     none="us_sim.tracking.filters:Unfiltered",
-    one_euro=Option(
-        "us_sim.tracking.filters:OneEuro",
-        "us_sim.tracking.settings:OneEuroSettings",
-    ),
+    one_euro=Option("us_sim.tracking.filters:OneEuro", "us_sim.tracking.settings:OneEuroSettings"),
     kalman=Option(
-        "us_sim.tracking.filters:ConstantVelocityKalman",
-        "us_sim.tracking.settings:KalmanSettings",
+        "us_sim.tracking.filters:ConstantVelocityKalman", "us_sim.tracking.settings:KalmanSettings"
     ),
 )
 
@@ -91,8 +87,7 @@ TRACKERS = Choice(
     tf=Option(f"{_INPUTS}.topic_inputs:TfInput", _NOTHING),
     camera=Option(f"{_INPUTS}.camera_input:CameraInput", "us_sim.tracking.settings:CameraSettings"),
     six_dof_mouse=Option(
-        f"{_INPUTS}.topic_inputs:SixDofMouseInput",
-        "us_sim.tracking.settings:SixDofMouseSettings",
+        f"{_INPUTS}.topic_inputs:SixDofMouseInput", "us_sim.tracking.settings:SixDofMouseSettings"
     ),
     haptic=Option(f"{_INPUTS}.topic_inputs:HapticInput", "us_sim.tracking.settings:HapticSettings"),
     openigtlink=Option(
@@ -120,17 +115,13 @@ EVALUATIONS = Choice(
     tissue=Option(f"{_EVALUATION}.tissue.report:TISSUE", _NOTHING),
     stability=Option(f"{_EVALUATION}.stability.report:STABILITY", _NOTHING),
     slice=Option(f"{_EVALUATION}.slice.report:SLICE", _NOTHING),
-    hand=Option(
-        f"{_EVALUATION}.hand.report:HAND",
-        f"{_EVALUATION}.settings:HandSettings",
-    ),
+    hand=Option(f"{_EVALUATION}.hand.report:HAND", f"{_EVALUATION}.settings:HandSettings"),
     tracking=Option(f"{_EVALUATION}.tracking.report:TRACKING", _NOTHING),
     image=Option(f"{_EVALUATION}.image.report:IMAGE", _NOTHING),
     latency=Option(f"{_EVALUATION}.latency.report:LATENCY", _NOTHING),
     viewer=Option(f"{_EVALUATION}.viewer.report:VIEWER", _NOTHING),
     measured=Option(
-        f"{_EVALUATION}.measured.report:MEASURED",
-        f"{_EVALUATION}.settings:MeasuredData",
+        f"{_EVALUATION}.measured.report:MEASURED", f"{_EVALUATION}.settings:MeasuredData"
     ),
 )
 

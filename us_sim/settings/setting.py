@@ -20,15 +20,14 @@ from __future__ import annotations
 import dataclasses
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field
+from dataclasses import dataclass, field
+from functools import cache
 from types import UnionType
 from typing import Any, ClassVar, Union, get_args, get_origin
 
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.spelling import describe_unknown, short_repr
-
-NUMBER = Quantity("number")
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class SettingRule:
 
     quantity: Quantity | None = None  # unit and range of a number, or of each number of a list
     description: str = ""  # for a person, without the unit
-    choices: tuple[str, ...] = ()  # the only texts that will do
+    choices: tuple[str, ...] = ()  # the only allowed texts
     choice: Any = None  # or the names that a `settings.choice.Choice` has
     place: str = "within"  # where the keys of what is chosen are, see `setting`
     file: bool = False  # a text that names a file
@@ -49,23 +48,20 @@ def setting(
     quantity: Quantity | None = None,
     description: str = "",
     *,
-    default: Any = MISSING,
-    default_factory: Any = MISSING,
-    kw_only: Any = MISSING,
     choices: Sequence[str] = (),
     choice: Any = None,
     place: str = "within",
     file: bool = False,
     live: bool = False,
     applies: tuple[str, tuple[str, ...]] | None = None,
+    **options: Any,
 ) -> Any:
-    """A field of a `Settings` class.
+    """Make a field of a `Settings` class.
 
     Args:
         quantity: unit and range of a number, or of each number in a list.
         description: what it is, without its unit, which `quantity` says.
-        default, default_factory, kw_only: as for `dataclasses.field`.
-        choices: the only texts that will do.
+        choices: the only allowed texts.
         choice: the registry that the value is a name in (type ``str``), or that it chooses from
             (type `ChosenOption`), or whose names are its keys (type ``dict``).
         place: where the keys of what is chosen stand. ``within`` the mapping under this field's
@@ -75,19 +71,18 @@ def setting(
         live: it may change while what it sets is running.
         applies: the name of another field, and the values of that with which this one means
             something.
+        options: ``default``, ``default_factory`` and others of `dataclasses.field`.
     """
     rule = SettingRule(quantity, description, tuple(choices), choice, place, file, live, applies)
-    return field(
-        default=default, default_factory=default_factory, kw_only=kw_only, metadata={"rule": rule}
-    )
+    return field(metadata={"rule": rule}, **options)
 
 
 @dataclass(frozen=True)
 class Settings:
     """Base of the frozen dataclasses whose fields are settings.
 
-    Each value is made what its type and its rule say, or refused. A subclass whose settings must
-    go together says so in `check`.
+    Each value is converted to its type by its rule, or refused. A subclass checks settings that
+    must go together in `check`.
 
     Raises:
         SettingsError: or what ``error`` names: a sentence with the section, the field, the value
@@ -110,7 +105,7 @@ class Settings:
             if value is not _default(type(self), name):
                 try:
                     value = convert_value(kinds[name], value, rule)
-                except RefusedValue as refusal:
+                except RefusedValueError as refusal:
                     raise self.make_error(f"{name}{refusal.key}", refusal.problem) from refusal
                 object.__setattr__(self, name, value)
         for name in rules_of(type(self)):
@@ -120,7 +115,7 @@ class Settings:
         self.check()
 
     def explain_inapplicable(self, name: str) -> str:
-        """The reason why a setting has no meaning beside another one; "" if it has."""
+        """Return the reason why a setting has no meaning beside another one; "" if it has."""
         applies = rules_of(type(self))[name].applies
         if applies is None:
             return ""
@@ -131,45 +126,39 @@ class Settings:
         return "" if chosen in values else f"is for {other} {wanted} only, not {chosen}"
 
     def get_upper_limit(self, name: str) -> float:
-        """The end of the range of a number beside the other settings."""
+        """Return the largest value of a number beside the other settings."""
         return rules_of(type(self))[name].quantity.maximum  # type: ignore[union-attr]
 
     def check(self) -> None:
         """Refuse values that do not go together."""
 
     def make_error(self, key: str, problem: str) -> UsSimError:
-        """The error for a wrong value of one of these settings."""
+        """Make the error for a wrong value of one of these settings."""
         error = self.error(f"{self.section}.{key}: {problem}" if self.section else problem)
         error.key, error.problem = key, problem
         return error
 
 
-class RefusedValue(ValueError):
-    """A refused value: the rest of the path of keys to it, and the fault."""
+class RefusedValueError(ValueError):
+    """A value that a setting refuses, with the rest of the path of keys to it, and the fault."""
 
     def __init__(self, problem: str, key: str = "") -> None:
         super().__init__(problem)
         self.key, self.problem = key, problem
 
 
-_rules: dict[type, dict[str, SettingRule]] = {}
-_kinds: dict[type, dict[str, Any]] = {}
-
-
+@cache
 def rules_of(settings: type) -> dict[str, SettingRule]:
-    """The rules of a dataclass's settings by name, in order; other fields are left out."""
-    if settings not in _rules:
-        fields = dataclasses.fields(settings)
-        _rules[settings] = {f.name: f.metadata["rule"] for f in fields if "rule" in f.metadata}
-    return _rules[settings]
+    """Return the rules of a dataclass's settings by name, in order; other fields are left out."""
+    fields = dataclasses.fields(settings)
+    return {f.name: f.metadata["rule"] for f in fields if "rule" in f.metadata}
 
 
+@cache
 def kinds_of(settings: type) -> dict[str, Any]:
-    """The types of a dataclass's settings by name."""
-    if settings not in _kinds:
-        hints = typing.get_type_hints(settings)
-        _kinds[settings] = {name: hints[name] for name in rules_of(settings)}
-    return _kinds[settings]
+    """Return the types of a dataclass's settings by name."""
+    hints = typing.get_type_hints(settings)
+    return {name: hints[name] for name in rules_of(settings)}
 
 
 def _default(settings: type, name: str) -> Any:
@@ -177,21 +166,21 @@ def _default(settings: type, name: str) -> Any:
 
 
 Converter = Callable[[Any, Any, SettingRule], Any]
-"""Takes the type of a value, the value and the rule of its setting; makes the one of the other."""
+"""Converts a value: takes the type, the value and the rule of its setting."""
 
 
 def convert_value(kind: Any, value: Any, rule: SettingRule, other: Converter | None = None) -> Any:
-    """The value as its type and rule say: numbers in SI units, lists as tuples.
+    """Convert a value to its type by its rule: numbers to SI units, lists to tuples.
 
     Args:
         kind: a type that a setting may have.
         value: as written in a file, given as a parameter, or in Python.
         rule: of the setting.
-        other: what makes values that are neither number, text, truth nor a list of them; without
+        other: converts values that are neither number, text, truth nor a list of them; without
             it they are left as they are.
 
     Raises:
-        Refusal: with the rest of the path of keys.
+        RefusedValueError: with the rest of the path of keys.
     """
     if get_origin(kind) in (Union, UnionType):
         if value is None:
@@ -202,7 +191,7 @@ def convert_value(kind: Any, value: Any, rule: SettingRule, other: Converter | N
         return _convert_number(kind, value, rule)
     if kind is bool:
         if not isinstance(value, bool):
-            raise RefusedValue(f"must be true or false, not {short_repr(value)}")
+            raise RefusedValueError(f"must be true or false, not {short_repr(value)}")
         return value
     if kind is str:
         return _convert_text(value, rule)
@@ -213,43 +202,43 @@ def convert_value(kind: Any, value: Any, rule: SettingRule, other: Converter | N
 
 def _convert_number(kind: type, value: Any, rule: SettingRule) -> float | int:
     try:
-        number = (rule.quantity or NUMBER).parse(value)
+        number = (rule.quantity or Quantity("number")).parse(value)
     except ValueError as error:
-        raise RefusedValue(str(error)) from error
+        raise RefusedValueError(str(error)) from error
     if kind is int and number != int(number):
-        raise RefusedValue(f"{short_repr(value)} is not a whole number")
+        raise RefusedValueError(f"{short_repr(value)} is not a whole number")
     return kind(number)  # type: ignore[no-any-return]
 
 
 def _convert_text(value: Any, rule: SettingRule) -> str:
     if not isinstance(value, str):
-        raise RefusedValue(f"must be a text, not {short_repr(value)}")
+        raise RefusedValueError(f"must be a text, not {short_repr(value)}")
     choices = rule.choice.names if rule.choice else rule.choices
     if choices and value not in choices:
-        raise RefusedValue(describe_unknown(value, choices))
+        raise RefusedValueError(describe_unknown(value, choices))
     return value
 
 
 def _convert_items(
     kinds: tuple[Any, ...], value: Any, rule: SettingRule, other: Converter | None
 ) -> Iterator[Any]:
-    """The items of a list, each converted; of a fixed number where the type says so."""
+    """Yield the items of a list, each converted; check their number where the type fixes it."""
     if isinstance(value, str | dict) or not hasattr(value, "__iter__"):
-        raise RefusedValue(f"must be a list, not {short_repr(value)}")
+        raise RefusedValueError(f"must be a list, not {short_repr(value)}")
     items = list(value)
     if kinds[-1] is Ellipsis:
         kinds = kinds[:1] * len(items)
     if len(items) != len(kinds):
-        raise RefusedValue(f"needs {len(kinds)} values, not {len(items)}")
+        raise RefusedValueError(f"needs {len(kinds)} values, not {len(items)}")
     for i, (kind, item) in enumerate(zip(kinds, items, strict=True)):
         try:
             yield convert_value(kind, item, rule, other)
-        except RefusedValue as refusal:
-            raise RefusedValue(refusal.problem, f"[{i}]{refusal.key}") from refusal
+        except RefusedValueError as refusal:
+            raise RefusedValueError(refusal.problem, f"[{i}]{refusal.key}") from refusal
 
 
 def _fits_type(kind: Any, value: object) -> bool:
-    """Whether a value looks like one of that type, where several are possible."""
+    """Return whether a value looks like one of that type, where several are possible."""
     if isinstance(value, list | tuple):
         return get_origin(kind) is tuple
     if isinstance(value, dict):

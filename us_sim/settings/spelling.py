@@ -24,12 +24,12 @@ _repr.maxstring = _repr.maxother = _LONGEST = 60
 
 
 def format_count(count: int, one: str, several: str | None = None) -> str:
-    """A number with its noun, ``1 frame`` or ``2 frames``; ``several`` where that is no mere s."""
+    """Write a number with its noun: ``1 frame``, ``2 frames``; ``several`` is another plural."""
     return f"{count} {one if count == 1 else several or f'{one}s'}"
 
 
 def align_columns(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list[str]:
-    """A line for each row, with columns below each other: those of ``left`` flush left."""
+    """Write each row as a line of aligned columns; those of ``left`` are flush left."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(
@@ -41,19 +41,19 @@ def align_columns(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -
 
 
 def short_repr(value: object) -> str:
-    """A value as a sentence shows it: in one line, and the start only where it is long."""
+    """Write a value in one line, cut where it is long."""
     text = " ".join(_repr.repr(value).split())
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
 def find_closest(name: object, known: Iterable[str]) -> str | None:
-    """The known name that is most like this one, if any is."""
+    """Return the known name that is most like this one; None if none is."""
     found = difflib.get_close_matches(str(name), list(known), n=1)
     return found[0] if found else None
 
 
 def describe_unknown(name: object, known: Iterable[str]) -> str:
-    """That a name is not one of those known, and which was probably meant."""
+    """Say that a name is not among the known ones, and which was probably meant."""
     known = list(known)
     like = find_closest(name, known)
     hint = f"; did you mean '{like}'?" if like else ""

@@ -84,7 +84,7 @@ def tabulate_settings(
 
 
 def describe_values(kind: Any, rule: SettingRule) -> str:
-    """Say the values of a setting of a type and rule in words."""
+    """Describe the values of a setting of a type and rule in words."""
     if get_origin(kind) in (Union, UnionType):
         options = [option for option in get_args(kind) if option is not type(None)]
         return ", or ".join(describe_values(option, rule) for option in options)
@@ -106,7 +106,7 @@ def describe_values(kind: Any, rule: SettingRule) -> str:
 
 
 def describe_default(settings: type[Settings], name: str) -> str:
-    """Say the default of a setting as a person reads it."""
+    """Describe the default of a setting as a person reads it."""
     field, rule = settings.__dataclass_fields__[name], rules_of(settings)[name]
     if field.default_factory is not MISSING:
         return _format_default(field.default_factory(), rule)
@@ -159,7 +159,7 @@ def _make_text(settings: type[Settings], path: str, shared: Mapping[type[Setting
 
 
 def _has_options(kind: Any, rule: SettingRule) -> bool:
-    """Whether a setting's values are options that have settings of their own."""
+    """Return whether a setting's values are options that have settings of their own."""
     return bool(rule.choice) and (_is_mapping(kind) or ChosenOption in (kind, *get_args(kind)))
 
 

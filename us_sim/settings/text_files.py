@@ -1,9 +1,9 @@
-"""YAML that a person wrote, each key once.
+r"""YAML that a person wrote, each key once.
 
 >>> from us_sim.settings.text_files import load_yaml
 >>> load_yaml("probe: {depth: 4 cm}")
 {'probe': {'depth': '4 cm'}}
->>> load_yaml("depth: 4 cm\\ndepth: 5 cm")
+>>> load_yaml("depth: 4 cm\ndepth: 5 cm")
 Traceback (most recent call last):
 us_sim.settings.text_files.YamlError: line 2: key `depth` is there twice, first in line 1: keep one
 """
@@ -25,7 +25,7 @@ class YamlError(UsSimError):
 
 
 def load_yaml(text: str) -> Any:
-    """The content of a YAML text, in Python's own types.
+    """Parse a YAML text into Python's own types.
 
     Raises:
         YamlError: it is not YAML, has a key twice, is larger than `LARGEST_YAML`, or is nested too
@@ -49,7 +49,7 @@ def load_yaml(text: str) -> Any:
 
 
 def read_yaml(path: Path, error_type: type[UsSimError]) -> Any:
-    """The content of a YAML file, in Python's own types; errors name it.
+    """Parse a YAML file into Python's own types; errors name the file.
 
     Raises:
         UsSimError: of that type, it cannot be read, or as `load_yaml`.
@@ -63,7 +63,7 @@ def read_yaml(path: Path, error_type: type[UsSimError]) -> Any:
 
 
 class _RepeatedKey(yaml.constructor.ConstructorError):
-    """A mapping has a key twice."""
+    """A mapping that has a key twice."""
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
