@@ -310,7 +310,7 @@ def test_forces_that_overflow_leave_the_latest_shape_and_say_so():
     skin = SkinMembrane(
         plane_surface((0.1, 0.1), 0.01), Sphere(0.03), MembraneSettings(time_step=1e-9)
     )
-    skin._stiffness = 1e308  # beyond any that settings allow
+    object.__setattr__(skin.settings, "stiffness", 1e308)  # beyond any that settings allow
     before = skin.deform(None).vertices
     found = skin.deform(Pose([0, 0, 0.01]))
     assert found.has_failed

@@ -55,7 +55,7 @@ SHORTEST = 0.5
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def spring_forces(force, x, rest, edges, natural_length, rest_tension, stiffness, anchor):
-    """Fills force (N, 3) N with that of the edge springs and the anchors."""
+    """Fill force (N, 3) N with that of the edge springs and the anchors."""
     for i in range(len(x)):
         for a in range(3):
             force[i, a] = anchor * (rest[i, a] - x[i, a])
@@ -89,8 +89,8 @@ class PartArrays(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def push_out(x, way, mass, parts, longest, box, start, end, fraction):
-    """Puts particles and parts inside the collider on its surface; returns how many.
+def push_out(x, way, mass, parts, longest, box, start, end, fraction):  # noqa: PLR0913
+    """Put particles and parts inside the collider on its surface; return how many.
 
     The probe is at ``fraction`` of the path from ``start`` to ``end``. ``way`` (N, 3) m is set to
     how far each particle of ``mass`` (N,) kg was pushed. No side of a triangle is longer than
@@ -133,7 +133,7 @@ def push_out(x, way, mass, parts, longest, box, start, end, fraction):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _is_parallel(a, b):
-    """Whether two vectors (3,) are, and neither is zero."""
+    """Return whether two vectors (3,) point the same way, and neither is zero."""
     dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     squares = (a[0] ** 2 + a[1] ** 2 + a[2] ** 2) * (b[0] ** 2 + b[1] ** 2 + b[2] ** 2)
     return squares > 0.0 and dot > 0.0 and dot * dot >= (1.0 - 1e-12) * squares
@@ -141,7 +141,7 @@ def _is_parallel(a, b):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _place(start, end, fraction):
-    """Rotation (3, 3) and place (3,) on the way from one placement to another."""
+    """Return the rotation (3, 3) and place (3,) at a fraction of the way between two placements."""
     cosine = start[3] * end[3] + start[4] * end[4] + start[5] * end[5] + start[6] * end[6]
     sign = 1.0 if cosine >= 0.0 else -1.0
     qx = start[3] + fraction * (sign * end[3] - start[3])
@@ -164,7 +164,7 @@ def _place(start, end, fraction):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _distance(box, r, a, b, c):
-    """Distance (m) and the collider's normal at a place (a, b, c) m from the probe's origin."""
+    """Return the distance (m) and the collider's normal at (a, b, c) m from the probe's origin."""
     x, y, z = rotate_vector_back(r, a, b, c)
     distance, nx, ny, nz = measure_box_distance(box, x, y, z)
     nx, ny, nz = rotate_vector(r, nx, ny, nz)
@@ -173,7 +173,7 @@ def _distance(box, r, a, b, c):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _push_particle(x, way, i, box, r, p):
-    """Puts a particle on the collider's surface if it is inside; returns its distance before."""
+    """Put a particle on the collider's surface if it is inside; return its distance before."""
     distance, nx, ny, nz = _distance(box, r, x[i, 0] - p[0], x[i, 1] - p[1], x[i, 2] - p[2])
     if distance < 0.0:
         for axis, n in enumerate((nx, ny, nz)):
@@ -183,9 +183,10 @@ def _push_particle(x, way, i, box, r, p):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _push_part(x, way, corners, gaps, mass, weight, box, r, p):
-    """Puts the place of weights (3,) among three particles on the collider's surface if it is
-    inside; returns how many. The particles are ``gaps`` (3,) m away from the collider.
+def _push_part(x, way, corners, gaps, mass, weight, box, r, p):  # noqa: PLR0913
+    """Put a point of a triangle on the collider's surface if it is inside; return how many.
+
+    The point has weights (3,) at three particles, which are ``gaps`` (3,) m from the collider.
     """
     a, b, c, light = -p[0], -p[1], -p[2], 0.0
     for q in range(3):
@@ -251,11 +252,6 @@ class SkinMembrane:
         self.settings = settings = settings or MembraneSettings()
         self.surface = surface
         self._collider = collider
-        self._stiffness = settings.stiffness
-        self._anchor = settings.anchor_stiffness
-        self._time_step = settings.time_step
-        self._steps = settings.steps
-
         # Unsigned, since numba tests a signed index for counting from the end.
         self._edges = edges = surface.edges.astype(np.uint32)
         at_rest = surface.vertices[edges[:, 1]] - surface.vertices[edges[:, 0]]
@@ -274,19 +270,19 @@ class SkinMembrane:
 
         valence = np.bincount(surface.edges.ravel(), minlength=len(surface.vertices))
         # Gershgorin's bound: no mode is stiffer than twice a particle's springs plus its anchor.
-        stiffest = 2.0 * self._stiffness * valence + self._anchor
+        stiffest = 2.0 * settings.stiffness * valence + settings.anchor_stiffness
         density_mass = settings.density * surface.vertex_areas
-        lightest = stiffest * (self._time_step / (2.0 * _SAFETY)) ** 2
+        lightest = stiffest * (settings.time_step / (2.0 * _SAFETY)) ** 2
         self.mass: NDArray[np.float64] = np.maximum(density_mass, lightest)  # (N,), kg
         self.step_limit = float(2.0 * np.sqrt(np.min(density_mass / stiffest)))
         """s, the longest stable step with the masses that follow from ``density``."""
-        self._decay = 2.0 * settings.damping * np.sqrt(self._anchor / self.mass)
+        self._decay = 2.0 * settings.damping * np.sqrt(settings.anchor_stiffness / self.mass)
         self._scaling = ""
         if (self.mass > density_mass).any():
             with np.errstate(divide="ignore"):
                 most = float(np.max(self.mass / density_mass))
             self._scaling = (
-                f"masses raised up to {most:.3g} times, as a step of {self._time_step:g} s is "
+                f"masses raised up to {most:.3g} times, as a step of {settings.time_step:g} s is "
                 f"stable only up to {self.step_limit:.2g} s without"
             )
         self._at_rest = SkinDeformation(
@@ -295,11 +291,11 @@ class SkinMembrane:
         self.reset()
 
     def with_settings(self, settings: MembraneSettings) -> SkinMembrane:
-        """The same surface and probe with other settings, at rest."""
+        """Return a membrane of the same surface and probe with other settings, at rest."""
         return SkinMembrane(self.surface, self._collider, settings)
 
     def reset(self) -> None:
-        """Back to the rest shape, without a probe."""
+        """Return to the rest shape, without a probe."""
         self._vertices = self.surface.vertices
         self._velocity = np.zeros_like(self._vertices)
         self._pose: Pose | None = None
@@ -319,18 +315,19 @@ class SkinMembrane:
         return self._velocity.copy()
 
     def deform(self, pose: Pose | None) -> SkinDeformation:
-        """The skin one frame later, with the probe moved to ``pose``, or away where it is None.
+        """Advance the skin by a frame, with the probe moved to ``pose``; None takes it away.
 
-        With an unmoved probe and a settled membrane, this is the latest result unchanged.
+        With an unmoved probe and a settled membrane the latest result is returned unchanged.
         """
         if self._settled and is_same_pose(pose, self._pose):
             return self._latest
         start, steps, note = self._approach(pose)
+        settings = self.settings
         vertices, velocity = self._vertices.copy(), self._velocity.copy()
         residual, moved, contacts = _relax(
             *(vertices, velocity, self.surface.vertices, self._edges, self._natural_length),
-            *(self._rest_tension, self._stiffness, self._anchor, self.mass, self._decay),
-            *(self._time_step, steps, self._parts, self._collider.offset_box),
+            *(self._rest_tension, settings.stiffness, settings.anchor_stiffness, self.mass),
+            *(self._decay, settings.time_step, steps, self._parts, self._collider.offset_box),
             *(_placement(start), _placement(pose), pose is not None),
         )
         finite = np.isfinite(vertices).all() and np.isfinite(velocity).all()
@@ -363,13 +360,13 @@ class SkinMembrane:
         return self._latest
 
     def _approach(self, pose: Pose | None) -> tuple[Pose | None, int, str]:
-        """The pose that the probe comes from, its number of steps, and a remark on them.
+        """Return the pose that the probe comes from, its number of steps, and a remark on them.
 
         A probe that appears inside the skin would push particles out on its far side. So it comes
         along its axis from where it touches nothing, in steps that are short against its body.
         """
         if pose is None:
-            return None, self._steps, ""
+            return None, self.settings.steps, ""
         start = self._pose
         if start is None or np.linalg.norm(pose.position - start.position) > _JUMP:
             start = self._lift(pose)
@@ -378,8 +375,8 @@ class SkinMembrane:
         reach = math.hypot(box[0], box[1], 2 * box[2]) + 2 * box[3]
         travel = float(np.linalg.norm(pose.position - start.position)) + turn * reach
         wanted = math.ceil(travel / (0.25 * (box[2] + box[3])))
-        steps = min(max(self._steps, wanted), _MOST_STEPS)
-        if steps == self._steps:
+        steps = min(max(self.settings.steps, wanted), _MOST_STEPS)
+        if steps == self.settings.steps:
             return start, steps, ""
         return start, steps, f"{steps} steps for a probe that moved {1e3 * travel:.3g} mm"
 
@@ -400,17 +397,16 @@ def _placement(pose: Pose | None) -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _relax(
+def _relax(  # noqa: PLR0913
     x, v, rest, edges, natural_length, rest_tension, stiffness, anchor, mass, decay,
     time_step, steps, parts, box, start, end, pressed,
 ):  # fmt: skip
-    """Moves the membrane on in time, and the probe from ``start`` to ``end``.
+    """Move the membrane on in time, and the probe from ``start`` to ``end``.
 
-    Args:
-        x, v: (N, 3) m and m/s, changed here. rest: (N, 3) m. edges: (E, 2).
-        natural_length: (E,) m. rest_tension: (E, 3) m, of a spring at rest, over its stiffness.
-        mass, decay: (N,) kg and 1/s. parts: `PartArrays`. box: the collider's ``offset_box``.
-        start, end: (7,) placements of the probe. pressed: whether there is one.
+    Positions x (N, 3) m and velocities v (N, 3) m/s are changed. ``rest_tension`` (E, 3) m is that
+    of a spring at rest over its stiffness, ``decay`` (N,) 1/s, ``parts`` `PartArrays`, ``box`` the
+    collider's ``offset_box``; ``start`` and ``end`` are (7,) placements of the probe, if there is
+    one (``pressed``).
 
     Returns:
         The residual, the farthest that a vertex moved (m), and the number in contact.
@@ -420,55 +416,59 @@ def _relax(
     force, last, way = np.empty((n, 3)), np.empty((n, 3)), np.zeros((n, 3))
     longest = _STRETCHED * _longest(x, edges)
     contacts = 0
-    awake = False
-    for i in range(n):
-        for a in range(3):
-            awake = awake or x[i, a] != rest[i, a] or v[i, a] != 0.0
+    awake = np.any(x != rest) or np.any(v != 0.0)
     for step in range(1, steps + 1):
         last[:] = x
         if awake:
             spring_forces(force, x, rest, edges, natural_length, rest_tension, stiffness, anchor)
-            for i in range(n):
-                gain = time_step / mass[i]
-                # The dampers act on the velocity at the end of the step: they cost no stability.
-                kept = 1.0 / (1.0 + time_step * decay[i])
-                for a in range(3):
-                    v[i, a] = kept * (v[i, a] + gain * force[i, a])
-                    x[i, a] += time_step * v[i, a]
+            _step(x, v, force, mass, decay, time_step)
         if pressed:
             contacts = push_out(x, way, mass, parts, longest, box, start, end, step / steps)
             awake = awake or contacts > 0
             for i in range(n if contacts else 0):
                 if way[i, 0] != 0.0 or way[i, 1] != 0.0 or way[i, 2] != 0.0:
                     _follow(x[i], last[i], time_step, v[i])
-
     if not awake:
         return 0.0, 0.0, contacts
     spring_forces(force, x, rest, edges, natural_length, rest_tension, stiffness, anchor)
+    squares = (x - before) ** 2
+    moved = np.sqrt((squares[:, 0] + squares[:, 1] + squares[:, 2]).max())
+    return _residual(x, rest, way, force, anchor), moved, contacts
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _step(x, v, force, mass, decay, time_step):
+    """Take a step of symplectic Euler under force (N, 3) N."""
+    for i in range(len(x)):
+        gain = time_step / mass[i]
+        # The dampers act on the velocity at the end of the step: they cost no stability.
+        kept = 1.0 / (1.0 + time_step * decay[i])
+        for a in range(3):
+            v[i, a] = kept * (v[i, a] + gain * force[i, a])
+            x[i, a] += time_step * v[i, a]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _residual(x, rest, way, force, anchor):
+    """Return the unbalanced force over the one that the anchors bear; 0 where they bear none."""
     unbalanced = 0.0
     borne = 0.0
-    moved = 0.0
-    for i in range(n):
+    for i in range(len(x)):
         # The contact force acts along the way a particle was pushed, and balances a force back.
         length = way[i, 0] ** 2 + way[i, 1] ** 2 + way[i, 2] ** 2
         along = way[i, 0] * force[i, 0] + way[i, 1] * force[i, 1] + way[i, 2] * force[i, 2]
         held = min(along, 0.0) / length if length > 0.0 else 0.0
-        distance = 0.0
         for a in range(3):
             unbalanced += (force[i, a] - held * way[i, a]) ** 2
             borne += (anchor * (x[i, a] - rest[i, a])) ** 2
-            distance += (x[i, a] - before[i, a]) ** 2
-        moved = max(moved, distance)
-    if borne == 0.0:
-        return 0.0, np.sqrt(moved), contacts
-    return np.sqrt(unbalanced / borne), np.sqrt(moved), contacts
+    return np.sqrt(unbalanced / borne) if borne != 0.0 else 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _follow(now, last, time_step, velocity):
-    """The velocity (3,) of a particle that was pushed: that of its way, but no faster than before.
+    """Give a pushed particle the velocity (3,) of its way, but no higher speed than before.
 
-    So contact never adds kinetic energy, and a particle at rest against the probe has none.
+    Thus contact never adds kinetic energy, and a particle at rest against the probe has none.
     """
     before = after = 0.0
     for a in range(3):
@@ -483,6 +483,7 @@ def _follow(now, last, time_step, velocity):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _longest(x, edges):
+    """Return the length (m) of the longest edge."""
     square = 0.0
     for e in range(len(edges)):
         i, j = edges[e]

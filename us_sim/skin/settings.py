@@ -8,12 +8,10 @@ from us_sim.errors import SolverError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-_STIFFNESS = Quantity("stiffness", 1e-6, 1e9)
-
 
 @dataclass(frozen=True)
 class MembraneSettings(Settings):
-    """The settings of the membrane.
+    """Settings of the membrane.
 
     Raises:
         SolverError: a value is out of range, with its name and the range.
@@ -27,7 +25,7 @@ class MembraneSettings(Settings):
     )
 
     anchor_stiffness: float = setting(
-        _STIFFNESS,
+        Quantity("stiffness", 1e-6, 1e9),
         "of the zero-length spring that ties a vertex to its place",
         default=4.0,
         live=True,

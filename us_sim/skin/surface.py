@@ -72,7 +72,7 @@ class TriangleSurface:
 
 
 def plane_surface(size: tuple[float, float], spacing: float) -> TriangleSurface:
-    """A flat sheet in z = 0 around the origin, with normals along -z, out of the body.
+    """Make a flat sheet in z = 0 around the origin, with normals along -z, out of the body.
 
     Args:
         size: m, along x and y.
@@ -88,7 +88,7 @@ def plane_surface(size: tuple[float, float], spacing: float) -> TriangleSurface:
 def bent_surface(
     size: tuple[float, float], spacing: float, *, flat_width: float, radius: float
 ) -> TriangleSurface:
-    """An arm-like sheet: flat in the middle, then bent towards +z in an arc on both sides.
+    """Make an arm-like sheet: flat in the middle, then bent towards +z in an arc on both sides.
 
     Args:
         size: m, along x (measured on the sheet, as if it were unrolled) and along y.
@@ -112,7 +112,7 @@ def bent_surface(
 
 
 def read_surface(path: Path | str, metres_per_unit: float = 1.0) -> TriangleSurface:
-    """A surface from an OBJ file, or from an STL, PLY or VTK file as far as meshio reads it.
+    """Read a surface from an OBJ file, or from an STL, PLY or VTK file by meshio.
 
     Quadrilaterals are split, vertices in the same place are joined, and those in no triangle are
     left out.
@@ -165,7 +165,7 @@ def _faces_by_meshio(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]
 
 
 def _steps(length: float, spacing: float) -> NDArray[np.float64]:
-    """Evenly spaced coordinates over a length around 0, at most ``spacing`` apart."""
+    """Return evenly spaced coordinates over a length around 0, at most ``spacing`` apart."""
     count = math.ceil(length / spacing - 1e-9)
     if count > 2000:
         raise MeshError(
@@ -176,7 +176,7 @@ def _steps(length: float, spacing: float) -> NDArray[np.float64]:
 
 
 def _sheet(profile: NDArray[np.float64], y: NDArray[np.float64]) -> TriangleSurface:
-    """The sheet swept along y by a profile (M, 2) of x and z, with alternating diagonals."""
+    """Sweep a profile (M, 2) of x and z along y to a sheet, with alternating diagonals."""
     m, n = len(profile), len(y)
     vertices = np.empty((m, n, 3))
     vertices[:, :, 0] = profile[:, :1]
@@ -193,7 +193,7 @@ def _sheet(profile: NDArray[np.float64], y: NDArray[np.float64]) -> TriangleSurf
 
 
 def parse_wavefront(text: str) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Points (N, 3), in the file's unit, and triangles (T, 3); polygons are split into fans.
+    """Return points (N, 3), in the file's unit, and triangles (T, 3); polygons become fans.
 
     Raises:
         MeshError: a vertex without three numbers, a face of fewer than three vertices, or one that
