@@ -5,7 +5,7 @@ Numba's compiler holds the interpreter's lock for most of its time. With Python'
 it hardly does.
 
 >>> from us_sim.tissue.elasticity.material import Material
->>> model = TissueModel.block(material=Material(10e3, 0.3, 1000.0))
+>>> model = TissueModel.make_block(material=Material(10e3, 0.3, 1000.0))
 >>> tissue = LiveTissue(model, TissueMethod("fem_cg", compared="fem"))
 >>> for _ in range(20):
 ...     deformation = tissue.deform(Pose(position=[0.0, 0.0, 0.01]))
@@ -55,14 +55,14 @@ class ShapeDifference:
 
 
 def measure_difference(first: NDArray[np.float64], second: NDArray[np.float64]) -> ShapeDifference:
-    """Largest and root-mean-square distance between two sets of node positions (N, 3) m."""
+    """Return the largest and the root-mean-square distance of two sets of positions (N, 3) m."""
     square = ((first - second) ** 2).sum(axis=1)
     return ShapeDifference(float(np.sqrt(square.max())), float(np.sqrt(square.mean())))
 
 
 @dataclass(frozen=True)
 class TissueMethod:
-    """What a tissue is deformed by."""
+    """Solver of a tissue, the one beside it, and their settings and materials."""
 
     solver: str  # name of the method
     compared: str = ""  # name of a second method that runs beside it, '' for none
@@ -83,14 +83,14 @@ class _Prepared:
 class LiveTissue:
     """Deforms a tissue by one solver, and by another on the same poses if asked.
 
-    Each solver is made once for a model and its settings, when it is first named. `prepare_method` makes
-    what another method needs in a thread while frames go on; `adopt_prepared` takes it over.
+    Each solver is made once for a model and its settings, when it is first named. `prepare_method`
+    makes what another method needs in a thread while frames go on; `adopt_prepared` takes it over.
 
     Args:
         model: shared by all solvers.
         method: to begin with.
-        constants: make those of the mesh's tetrahedra from materials by label, where these change.
-        progress: told the fraction done, and what is being made or compiled.
+        constants: makes those of the mesh's tetrahedra from materials by label, where these change.
+        progress: called with the fraction done, and what is being made or compiled.
 
     Raises:
         SolverError: no such solver, one compared with itself, or a model it cannot solve.
@@ -121,14 +121,14 @@ class LiveTissue:
 
     @property
     def preparation_status(self) -> str:
-        """What is being prepared, for how long already, and how far it is; '' without any."""
+        """Text on the method in preparation, its time so far, and its progress; "" without any."""
         if self._wanted is self.method:
             return ""
         seconds = time.monotonic() - self._began
         return f"preparing {self._reason} for {seconds:.0f} s{self._progress}"
 
     def deform(self, pose: Pose | None, frame_limit: float | None = None) -> Deformation:
-        """One frame of the solver in use, and of the one beside it.
+        """Advance the solver in use by a frame, and the one beside it.
 
         Args:
             pose: of the probe in frame ``patient``, or None when none is near.
@@ -148,11 +148,13 @@ class LiveTissue:
         self.difference = None
 
     def prepare_method(self, method: TissueMethod, reason: str, *, wait: bool = False) -> None:
-        """Prepare another method; the newest wins, and the present one drops what is prepared.
+        """Prepare another method in a thread; only the newest call counts.
+
+        A call with the present method drops what was prepared.
 
         Args:
-            method: that is wanted.
-            reason: what was changed, for a person.
+            method: the one to prepare.
+            reason: the change that asks for it, for a person.
             wait: until it can be adopted.
         """
         self._prepared, self._progress, self._reason = None, "", reason
@@ -239,13 +241,13 @@ def compile_solver(
     settings: SolverSettings | None = None,
     progress: Progress | None = None,
 ) -> TissueSolver:
-    """A solver, none of whose frames will have to compile anything.
+    """Make a solver, none of whose frames will have to compile anything.
 
     Args:
         solver: the class of the method.
         model: of the tissue.
         settings: of the solver.
-        progress: told the fraction done and what is being made or compiled.
+        progress: called with the fraction done and what is being made or compiled.
 
     Raises:
         SolverError: as `create_solver`.

@@ -55,9 +55,10 @@ _GRAZING = 0.1
 
 
 def describe_held_nodes(name: str, nodes: NDArray[np.integer], mesh: TetrahedralMesh) -> str | None:
-    """How many nodes a name in a scene's ``fixed`` holds, for a person.
+    """Say how many nodes a name in a scene's ``fixed`` holds; None where nothing is to be said.
 
-    Of a mesh from a file, which may touch its bounding box at single nodes, and where they are few.
+    It is said of a mesh from a file, which may touch its bounding box at single nodes, and where
+    they are few.
     """
     count, of = len(nodes), len(mesh.nodes)
     said = f"fixed: `{name}` holds {count} of {of} nodes"
@@ -67,12 +68,13 @@ def describe_held_nodes(name: str, nodes: NDArray[np.integer], mesh: Tetrahedral
 
 
 def face_nodes(mesh: TetrahedralMesh, face: str, margin: float | None = None) -> NDArray[np.int32]:
-    """(K,) nodes at a face of the mesh's bounding box, ascending.
+    """Return (K,) nodes at a face of the mesh's bounding box, ascending.
 
     Of a box mesh, those in the plane of the face; of any other, those of its boundary that are
     near to it, since an organ touches its bounding box at single nodes.
 
     Args:
+        mesh: of the tissue.
         face: a name from `FACES`; ``top`` is the skin, ``sides`` are the four that stand on it.
         margin: m, how near, for a mesh that is no box; by default a twentieth of its size along
             that axis.
@@ -98,9 +100,10 @@ def face_nodes(mesh: TetrahedralMesh, face: str, margin: float | None = None) ->
 
 
 def facing_nodes(mesh: TetrahedralMesh) -> NDArray[np.int32]:
-    """(K,) nodes of the boundary that look towards the probe, which comes along +z, ascending.
+    """Return (K,) nodes of the boundary that look towards the probe, ascending.
 
-    Those whose normal, of the adjacent triangles weighted by area, is less than 84 degrees off -z.
+    The probe comes along +z: their normal, of the adjacent triangles weighted by area, is less than
+    84 degrees off -z.
     """
     a, b, c = (mesh.nodes[mesh.boundary[:, corner]] for corner in range(3))
     areas = np.cross(b - a, c - a)
@@ -114,7 +117,7 @@ def facing_nodes(mesh: TetrahedralMesh) -> NDArray[np.int32]:
 def nodes_in_label(
     mesh: TetrahedralMesh, fractions: LabelFractions, label: int
 ) -> NDArray[np.int32]:
-    """(K,) nodes whose tetrahedra are mostly filled by a label, such as bone, ascending."""
+    """Return (K,) nodes whose tetrahedra are mostly filled by a label, such as bone, ascending."""
     filled = fractions.for_label(label)
     around = mesh.tetrahedra.ravel()
     volume = np.bincount(around, np.repeat(mesh.volumes, 4), len(mesh.nodes))
@@ -162,7 +165,7 @@ class TissueState:
 
     @classmethod
     def at_rest(cls, count: int) -> TissueState:
-        """Undeformed and still, for ``count`` nodes."""
+        """Return the state of an undeformed, still tissue of ``count`` nodes."""
         return cls(np.zeros((count, 3)), np.zeros((count, 3)))
 
 
@@ -203,7 +206,7 @@ class TissueModel:
         held: Sequence[str] = ("bottom",),
         gravity: ArrayLike = (0.0, 0.0, 0.0),
     ) -> TissueModel:
-        """A box of one material, or of layers, with its top around the origin.
+        """Make a box of one material, or of layers, with its top around the origin.
 
         Args:
             size: m, along x, y and z.

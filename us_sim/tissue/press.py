@@ -2,7 +2,7 @@
 
 >>> from us_sim.tissue.model import TissueModel
 >>> from us_sim.tissue.solvers.solver import create_solver
->>> curve = press_to_force(create_solver("fem", TissueModel.block()), 2.0)
+>>> curve = press_to_force(create_solver("fem", TissueModel.make_block()), 2.0)
 >>> f"{curve[-1].force:.2f} N at {1e3 * curve[-1].depth:.1f} mm"
 '2.00 N at 7.6 mm'
 """
@@ -98,7 +98,7 @@ def press_to_force(
     tried: list[Press] = []
 
     def excess(depth: float) -> float:
-        """N, of the force; nothing as soon as it is within the tolerance."""
+        """Press to a depth; return the force (N) beyond the wanted one, 0 within the tolerance."""
         tried.append(press(depth))
         over = tried[-1].force - force
         return 0.0 if abs(over) <= tolerance * force else over
@@ -111,7 +111,7 @@ def press_to_force(
 def strains_along(
     mesh: TetrahedralMesh, nodes: NDArray[np.float64], direction: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(M,), how much longer lines along a direction (3,) at rest are; below zero: pressed together.
+    """Return (M,), the elongation of lines along a direction (3,) at rest; negative if pressed.
 
     Args:
         mesh: at rest.

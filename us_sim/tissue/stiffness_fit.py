@@ -159,7 +159,7 @@ def fit_stiffness(
         moduli: Pa, of all structures, to begin with.
         press: the recording.
         settings: what to keep, how many poses, how wide an interval may be.
-        progress: told the fraction done of a press, and the misfit.
+        progress: called with the fraction done of a press, and the misfit.
 
     Raises:
         StiffnessError: the press does not determine a modulus, or is not one of this tissue.
@@ -231,7 +231,9 @@ def simulate_wrenches(
     depths: NDArray[np.float64],
     progress: Progress | None = None,
 ) -> NDArray[np.float64]:
-    """(K, 6) N and N m, on the probe in its frame, at poses of depths (K,) m in the tissue at rest.
+    """Simulate the wrenches (K, 6) N and N m on the probe, in its frame, at poses.
+
+    ``depths`` (K,) m are those in the tissue at rest.
 
     Raises:
         StiffnessError: the tissue does not come to balance at a pose.
@@ -256,7 +258,7 @@ def simulate_wrenches(
 def compute_half_widths(
     slopes: NDArray[np.float64], left: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(P,) half of the 95 % intervals of unknowns with slopes (n, P) and residuals (n,)."""
+    """Return (P,) half of the 95 % intervals of unknowns with slopes (n, P), residuals (n,)."""
     normal = slopes.T @ slopes
     ridge = 1e-12 * np.trace(normal) * np.eye(len(normal))  # makes what is not felt very wide
     variance = left @ left / (len(left) - len(normal)) * np.diag(np.linalg.inv(normal + ridge))
@@ -269,13 +271,13 @@ def compute_half_widths(
 
 
 def _depth(model: TissueModel, pose: Pose) -> float:
-    """m, of the probe in the tissue at rest; below zero outside."""
+    """Return the depth (m) of the probe in the tissue at rest; below zero outside."""
     touched = model.mesh.nodes[model.contact_nodes]
     return -float(measure_gaps(model.collider, pose, touched, model.contact_spacing)[0].min())
 
 
 def _choose_poses(depths: NDArray[np.float64], count: int) -> NDArray[np.intp]:
-    """The poses to look at, in the order of time: as many in the tissue as without contact.
+    """Choose poses in the order of time: as many in the tissue as without contact.
 
     Raises:
         StiffnessError: too few press the tissue.

@@ -58,13 +58,13 @@ class ActiveSet:
         self.normal_force = np.zeros(len(rest))  # (C,) N, along the normal
 
     def clear(self) -> None:
-        """Touch nothing."""
+        """Let go of all nodes."""
         self.touched[:] = False
         self.normal[:] = 0.0
         self.normal_force[:] = 0.0
 
     def mark_touching(self, pose: Pose, displacement: NDArray[np.float64]) -> None:
-        """Take nodes on the probe's surface as touched; a revision lets go the pulled ones."""
+        """Mark the nodes on the probe's surface as touched; the next update lets pulled ones go."""
         gap, self.normal = self._measure_gaps(pose, self._rest + displacement)
         self.touched = gap < _NEAR
         self.normal_force[:] = 0.0
@@ -83,7 +83,7 @@ class ActiveSet:
             pose: of the probe, or None when none is near.
             displacement: (C, 3) m, corrected in place.
             exactly: whether nodes that slid a little are corrected too.
-            moved: whether the probe has moved since the last revision.
+            moved: whether the probe has moved since the last update.
 
         Returns:
             Whether the equations changed: the set, a normal, or a displacement.
@@ -111,7 +111,7 @@ class ActiveSet:
         return True
 
     def is_consistent(self, pose: Pose | None, displacement: NDArray[np.float64]) -> bool:
-        """Whether a revision would change nothing."""
+        """Return whether an update would change nothing."""
         if pose is None:
             return not self.touched.any()
         gap, _ = self._measure_gaps(pose, self._rest + displacement)
@@ -124,20 +124,18 @@ class ActiveSet:
     def compute_normals(
         self, pose: Pose | None, displacement: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """(C, 3) directions in which the probe pushes touched nodes where they are; else zero."""
+        """Return (C, 3) directions in which the probe pushes touched nodes; zero at all others."""
         if pose is None:
             return np.zeros_like(self.normal)
         _, normal = self._measure_gaps(pose, self._rest + displacement)
         return np.where(self.touched[:, None], normal, 0.0)
 
     def set_forces(self, force: NDArray[np.float64]) -> None:
-        """Set the push: the part along the normal of the forces (C, 3) N that hold the nodes."""
+        """Set the pushes: the normal parts of the forces (C, 3) N that hold the nodes."""
         self.normal_force = np.where(self.touched, np.einsum("ij,ij->i", force, self.normal), 0.0)
-
-    def _margin(self) -> NDArray[np.float64]:
-        return np.where(self.touched, _SKIRT * self._spacing, 0.0)
 
     def _measure_gaps(
         self, pose: Pose, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return measure_gaps(self._collider, pose, points, self._spacing, self._margin())
+        skirt = np.where(self.touched, _SKIRT * self._spacing, 0.0)
+        return measure_gaps(self._collider, pose, points, self._spacing, skirt)

@@ -89,20 +89,20 @@ def solve_active(delassus, rhs, index, count, factor, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def solve_by_pivoting(delassus, gap, push, active):
-    """The pivoting of `solve_unilateral`: fills push (k,), and active (k,), which holds the guess."""
+    """Solve as `solve_unilateral` does.
+
+    ``push`` (k,) is filled; ``active`` (k,) comes in as the guess and goes out as the solution.
+    """
     k = len(gap)
     factor = np.empty((k, k))
     solution = np.empty(k)
     index = np.empty(k, dtype=np.int64)
     opened = np.empty(k)
+    wrong = np.empty(k, dtype=np.bool_)
     tolerance = _ROUNDING * np.abs(gap).max()
     fewest, failures_left, single = k + 1, _BLOCK_FAILURES, 0
     while single <= _SINGLE_PIVOTS * k:
-        count = np.int64(0)  # a literal would have the callees compiled for it, too
-        for i in range(k):
-            if active[i]:
-                index[count] = i
-                count += 1
+        count = _list_active(active, index)
         solve_active(delassus, -gap, index, count, factor, solution)
         push[:] = 0.0
         heaviest = 0.0
@@ -110,37 +110,48 @@ def solve_by_pivoting(delassus, gap, push, active):
             push[index[m]] = solution[m]
             heaviest = max(heaviest, abs(solution[m]))
         _open(delassus, gap, index, count, push, opened)
-        wrong, first = 0, -1
-        for i in range(k):
-            bad = push[i] < -_ROUNDING * heaviest if active[i] else opened[i] < -tolerance
-            if bad:
-                wrong += 1
-                if first < 0:
-                    first = i
-        if wrong == 0:
-            for i in range(k):
-                push[i] = max(push[i], 0.0)
-                active[i] = push[i] > 0.0
-            return
-        if wrong < fewest:
-            fewest, failures_left = wrong, _BLOCK_FAILURES
+        failures = _mark_wrong(push, opened, active, _ROUNDING * heaviest, tolerance, wrong)
+        if failures == 0:
+            break
+        if failures < fewest:
+            fewest, failures_left = failures, _BLOCK_FAILURES
         else:
             failures_left -= 1
-        if failures_left > 0:
-            for i in range(k):
-                if push[i] < -_ROUNDING * heaviest if active[i] else opened[i] < -tolerance:
-                    active[i] = not active[i]
-        else:
+        if failures_left <= 0:
             single += 1
-            active[first] = not active[first]
-    _relax(delassus, gap, push, tolerance)
+            wrong[np.argmax(wrong) + 1 :] = False
+        active ^= wrong
+    else:
+        _relax(delassus, gap, push, tolerance)
     for i in range(k):
+        push[i] = max(push[i], 0.0)
         active[i] = push[i] > 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _list_active(active, index):
+    """Fill index with the active nodes; return their number."""
+    count = np.int64(0)  # a literal would have the callees compiled for it, too
+    for i in range(len(active)):
+        if active[i]:
+            index[count] = i
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mark_wrong(push, opened, active, least_push, least_gap, wrong):
+    """Fill wrong (k,), where a push or a gap is below the negative tolerance; return how many."""
+    count = 0
+    for i in range(len(push)):
+        wrong[i] = push[i] < -least_push if active[i] else opened[i] < -least_gap
+        count += wrong[i]
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _open(delassus, gap, index, count, push, opened):
-    """Fills opened (k,) with delassus push + gap, pushes being at ``index`` only."""
+    """Fill opened (k,) with delassus push + gap; there are pushes at ``index`` only."""
     for i in range(len(gap)):
         opened[i] = gap[i]
     for m in range(count):
@@ -153,7 +164,7 @@ def _open(delassus, gap, index, count, push, opened):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _relax(delassus, gap, push, tolerance):
-    """Projected Gauss-Seidel on push (k,), which comes in as a guess."""
+    """Improve a guess of push (k,) by projected Gauss-Seidel."""
     k = len(gap)
     for i in range(k):
         push[i] = max(push[i], 0.0)
@@ -181,7 +192,7 @@ def predict_forces(
     softness: NDArray[np.float64],
     reach: float,
 ) -> NDArray[np.float64]:
-    """How the contact forces change, so that linear tissue obeys the law of contact again.
+    """Predict how contact forces change until linear tissue obeys the law of contact again.
 
     >>> compliance = np.eye(6)  # of two nodes that do not know of each other
     >>> down = np.array([[0.0, 0.0, 1.0]] * 2)
@@ -214,7 +225,7 @@ def predict_forces(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _normal_problem(compliance, near, loaded, normal, gap, load):
-    """Delassus matrix (K, K) of ``near`` nodes, and gaps (K,) with the loads taken off."""
+    """Return the Delassus matrix (K, K) of ``near`` nodes, and their gaps (K,) without loads."""
     count = len(near)
     delassus = np.empty((count, count))
     opened = np.empty(count)

@@ -1,8 +1,8 @@
 """A probe on an elastic surface of known compliance, solved to rounding.
 
-By Newton's method: at every round the probe is replaced by its tangent planes
-where the nodes now are, the linear complementarity problem between forces and gaps is solved
-exactly, and the nodes are moved. On a curved probe the planes turn with them, which Anderson's
+By Newton's method: at every round the probe is replaced by its tangent planes where the nodes now
+are, the linear complementarity problem between forces and gaps is solved exactly, and the nodes are
+moved. On a curved probe the planes turn with them, which Anderson's
 mixing of the last rounds takes into account (D. G. Anderson, Iterative procedures for nonlinear
 integral equations, J. ACM 12, 1965), so that a few rounds bring the gaps below a nanometre.
 
@@ -82,7 +82,7 @@ class CompliantContact:
         self.sliding_force = 0.0  # N, norm of the forces along the surface at pushed nodes
 
     def clear(self) -> None:
-        """Touch nothing."""
+        """Take the probe away."""
         self.forces[:] = 0.0
         self.displacement[:] = 0.0
         self.near[:] = False
@@ -91,7 +91,7 @@ class CompliantContact:
     def press_at(self, pose: Pose) -> bool:
         """Find the forces of the probe at a pose, starting from the last ones.
 
-        Only nodes near the probe are considered; `add_overlooked` tells whether that was enough.
+        Only nodes near the probe are considered; `add_overlooked` finds any others.
 
         Returns:
             Whether all gaps are closed or open as they should be, to a nanometre.
@@ -101,7 +101,7 @@ class CompliantContact:
         return self.solve(pose)
 
     def add_overlooked(self, pose: Pose, displacement: NDArray[np.float64]) -> bool:
-        """Whether nodes that the last press did not consider are in the probe.
+        """Consider entered nodes that the last solution left out; return whether there are any.
 
         Args:
             pose: of the probe.
@@ -132,7 +132,7 @@ class CompliantContact:
         return gap
 
     def solve(self, pose: Pose) -> bool:
-        """As `press_at`, with the nodes that `add_overlooked` found besides."""
+        """Find the forces on the nodes considered so far; return as `press_at`."""
         near = np.flatnonzero(self.near)
         displacement = self.displacement[near]
         forces = self.forces[near]
@@ -156,7 +156,7 @@ class CompliantContact:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _gather(compliance, near):
-    """(3k, 3k) m/N, the compliance between the nodes ``near`` (k,)."""
+    """Return (3k, 3k) m/N, the compliance between the nodes ``near`` (k,)."""
     k = len(near)
     block = np.empty((3 * k, 3 * k))
     for m in range(k):
@@ -169,8 +169,10 @@ def _gather(compliance, near):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_gaps(box, forward, rotation, origin, rest, index, displacement, skirt, gap, normal):
-    """Fills gap (k,) and normal (k, 3) of the nodes ``index`` of rest, displaced by (k, 3)."""
+def _fill_gaps(  # noqa: PLR0913
+    box, forward, rotation, origin, rest, index, displacement, skirt, gap, normal
+):
+    """Fill gap (k,) and normal (k, 3) of the nodes ``index`` of rest, displaced by (k, 3)."""
     r = rotation
     for m in range(len(index)):
         i = index[m]
@@ -184,31 +186,28 @@ def _fill_gaps(box, forward, rotation, origin, rest, index, displacement, skirt,
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def _newton(box, forward, rotation, origin, rest, spacing, compliance, near, displacement, forces):
-    """Revises displacement (k, 3) and forces (k, 3) of the nodes ``near``.
+def _newton(  # noqa: PLR0913
+    box, forward, rotation, origin, rest, spacing, compliance, near, displacement, forces
+):
+    """Find displacement (k, 3) and forces (k, 3) of the nodes ``near``, which come in as a guess.
 
-    Returns whether it converged, and the norm of the forces along the surface.
+    Returns:
+        Whether it converged, and the norm of the forces along the surface.
     """
     k = len(near)
     block = _gather(compliance, near)
     gap, normal = np.empty(k), np.empty((k, 3))
-    active, was = np.zeros(k, np.bool_), np.zeros(k, np.bool_)
-    joined, skirt = np.zeros(k, np.int64), np.zeros(k)
-    for m in range(k):
-        if forces[m, 0] != 0.0 or forces[m, 1] != 0.0 or forces[m, 2] != 0.0:
-            active[m] = True
-            joined[m] = 1
-            skirt[m] = _SKIRT * spacing
+    active = (forces[:, 0] != 0.0) | (forces[:, 1] != 0.0) | (forces[:, 2] != 0.0)
+    joined = active.astype(np.int64)  # how often each node has come to be pushed
+    skirt = _SKIRT * joined * spacing
     point = displacement.copy()  # where the planes touch the probe
-    step, last_step = np.empty((k, 3)), np.empty((k, 3))
-    last_point = np.empty((k, 3))
+    last_point, last_step = point, point
     points, steps = np.empty((_MEMORY, k, 3)), np.empty((_MEMORY, k, 3))
     remembered = 0
     converged, sliding = False, 0.0
     for iteration in range(_ROUNDS):
         _fill_gaps(box, forward, rotation, origin, rest, near, point, skirt, gap, normal)
-        for m in range(k):
-            was[m] = active[m]
+        was = active.copy()
         _solve_planes(block, point, gap, normal, _AHEAD * spacing, iteration == 0, active, forces)
         same = iteration > 0
         for m in range(k):
@@ -218,37 +217,32 @@ def _newton(box, forward, rotation, origin, rest, spacing, compliance, near, dis
                     joined[m] += 1
                     skirt[m] = _SKIRT * joined[m] * spacing
         _displace(block, active, forces, displacement)
-        for m in range(k):
-            for axis in range(3):
-                step[m, axis] = displacement[m, axis] - point[m, axis]
+        step = displacement - point
         _fill_gaps(box, forward, rotation, origin, rest, near, displacement, skirt, gap, normal)
         converged, sliding = _check(gap, normal, active, forces)
         if converged or iteration == _ROUNDS - 1:
             break
         if same:
             slot = remembered % _MEMORY
-            for m in range(k):
-                for axis in range(3):
-                    points[slot, m, axis] = point[m, axis] - last_point[m, axis]
-                    steps[slot, m, axis] = step[m, axis] - last_step[m, axis]
+            points[slot] = point - last_point
+            steps[slot] = step - last_step
             remembered += 1
         else:
             remembered = 0
         if iteration >= _MIXED:
             point += _SHORT * step
             continue
-        for m in range(k):
-            for axis in range(3):
-                last_point[m, axis] = point[m, axis]
-                last_step[m, axis] = step[m, axis]
+        last_point, last_step = point.copy(), step
         _mix(active, step, points, steps, min(remembered, _MEMORY), point)
     return converged, sliding
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def _solve_planes(block, point, gap, normal, limit, first, active, forces):
-    """Fills active (k,), which comes in as a guess, and forces (k, 3), with the planes of the probe
-    at point (k, 3) displaced nodes, where their gap is (k,) and its normal (k, 3).
+    """Solve the contact with the probe's tangent planes for active (k,) and forces (k, 3).
+
+    The planes touch the probe where nodes are displaced by ``point`` (k, 3); there gaps are (k,)
+    and normals (k, 3). ``active`` comes in as a guess.
     """
     k = len(gap)
     chosen = np.flatnonzero((gap < limit) | (active & np.isfinite(gap)))
@@ -283,7 +277,7 @@ def _solve_planes(block, point, gap, normal, limit, first, active, forces):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def _displace(block, active, forces, displacement):
-    """Fills displacement (k, 3) that forces (k, 3) at active nodes cause."""
+    """Fill displacement (k, 3) that forces (k, 3) at active nodes cause."""
     load = np.zeros(len(block))
     for m in np.flatnonzero(active):
         for axis in range(3):
@@ -298,7 +292,7 @@ def _displace(block, active, forces, displacement):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _check(gap, normal, active, forces):
-    """Whether gaps and normals have converged, and the norm of the forces along the surface."""
+    """Return whether gaps and normals have converged, and the norm of forces along the surface."""
     fits = True
     load, sliding = 0.0, 0.0
     for m in range(len(gap)):
@@ -317,7 +311,7 @@ def _check(gap, normal, active, forces):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _mix(active, step, points, steps, count, point):
-    """Anderson's mixing: moves point (k, 3) by its step less the part the last changes explain."""
+    """Move point (k, 3) by its step, less the part that the last changes explain (Anderson)."""
     gram = np.zeros((count, count))
     weight = np.zeros(count)
     for m in range(len(active)):

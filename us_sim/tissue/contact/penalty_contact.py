@@ -110,7 +110,7 @@ class PenaltyContact:
         self._measure(np.full(count, np.inf))
 
     def measure_depth(self, pose: Pose, positions: NDArray[np.float64]) -> float:
-        """How deep (m) a probe would be in points (P, 3) m, at least 0."""
+        """Return how deep (m) a probe would be in points (P, 3) m, at least 0."""
         gap, _ = self.probe.measure_distances(pose, positions)
         return max(0.0, -float(gap.min(initial=np.inf)))
 
@@ -136,8 +136,9 @@ class PenaltyContact:
         self.update_relief()
 
     def drop_planes(self, positions: NDArray[np.float64]) -> bool:
-        """Let the shape itself push the points at ``positions`` (P, 3) m again, not planes, and any
-        that have come near since the probe was put there.
+        """Let the shape itself push the points at ``positions`` (P, 3) m again, not planes.
+
+        Points that have come near since the pose was set are pushed, too.
 
         Returns:
             Whether that changes anything.
@@ -153,7 +154,7 @@ class PenaltyContact:
         return planar > 0 or not np.array_equal(self.normal_force, before)
 
     def update_relief(self) -> float:
-        """Measure the relief of gaps anew, where the points are.
+        """Update the relief of gaps where the points are now.
 
         Returns:
             m, by how much it changes at most where the probe pushes.
@@ -199,7 +200,7 @@ class PenaltyContact:
         return slope
 
     def curvature(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(K, 3, 3) 1/m, how the push would turn as points (K, 3) m move; zero without a probe."""
+        """Return (K, 3, 3) 1/m, how the push turns as points (K, 3) m move; 0 without a probe."""
         if self._pose is None:
             return np.zeros((len(positions), 3, 3))
         return self.probe.curvature(self._pose, positions)
@@ -211,7 +212,7 @@ class PenaltyContact:
         return force
 
     def force_after(self, change: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(P, 3) N, `force` after points moved by ``change`` (P, 3) m, as normals are now."""
+        """Return (P, 3) N, `force` after points moved by ``change`` (P, 3) m; normals stay."""
         force = np.zeros_like(self.normal)
         _forces(self.near, self.gap, self.normal, change, *self._law, force)
         return force
@@ -219,8 +220,10 @@ class PenaltyContact:
     def springs_after(
         self, change: NDArray[np.float64]
     ) -> tuple[NDArray[np.integer], NDArray[np.float64], NDArray[np.float64]]:
-        """How that falls with the change: points (K,), the springs' directions (K, 3) and
-        stiffnesses (K,) N/m.
+        """Linearise `force_after` at a change (P, 3) m.
+
+        Returns:
+            Points (K,), and their springs' directions (K, 3) and stiffnesses (K,) N/m.
         """
         slope = np.zeros_like(self.gap)
         _slopes(self.near, self.gap, self.normal, change, *self._law, slope)
@@ -230,8 +233,14 @@ class PenaltyContact:
     def geometric_stiffness(
         self, positions: NDArray[np.float64], push: NDArray[np.float64]
     ) -> tuple[NDArray[np.integer], NDArray[np.float64]]:
-        """How forces turn as points (P, 3) m, pushed by (P,) N, move along a bent surface: points
-        (K,), and (K, 3, 3) N/m.
+        """Return how pushes turn as points move along a curved probe.
+
+        Args:
+            positions: (P, 3) m.
+            push: (P,) N, at the points.
+
+        Returns:
+            Points (K,), and (K, 3, 3) N/m.
         """
         bent = push > 0.0
         bent[self._planar] = False
@@ -243,8 +252,9 @@ class PenaltyContact:
     def work_along(
         self, start: NDArray[np.float64], change: NDArray[np.float64], length: float
     ) -> float:
-        """J, of the forces after points moved by ``start + length * change`` (P, 3) m, along the
-        change.
+        """Return the work (J) of the forces along a change (P, 3) m.
+
+        The forces are those after the points have moved by ``start + length * change``.
         """
         return float(_work(self.near, self.gap, self.normal, start, change, length, *self._law))
 
@@ -255,13 +265,13 @@ class PenaltyContact:
         pull: float,
         curvature: float,
     ) -> float:
-        """How much of a change, along which the tissue's forces are linear, lowers the energy most.
+        """Find the fraction of a change that lowers the energy most; below one where points touch.
 
-        It is less than all where points come to be touched.
+        The tissue's forces are linear along the change.
 
         Args:
             start: (P, 3) m, how far the points have moved before.
-            change: (P, 3) m, theirs.
+            change: (P, 3) m, of the points.
             pull: J, of the tissue's forces now along the change of all nodes.
             curvature: J, of its tangent along that.
         """
@@ -281,13 +291,14 @@ class PenaltyContact:
 
 @njit(**_LOOP, inline="always")
 def _spring_force(depth, stiffness, stiffening):
+    """Return the push (N) of a spring at a depth (m)."""
     ratio = depth / stiffening
     return stiffness * depth * (1.0 + ratio * ratio)
 
 
 @njit(**_LOOP)
 def _normal_forces(near, gap, stiffness, deepest, stiffening, push):
-    """Fills push (P,) of the points that are near; returns the springs' energy."""
+    """Fill push (P,) of the points that are near; return the springs' energy."""
     energy = 0.0
     for i in near:
         depth = max(-gap[i], 0.0)
@@ -301,7 +312,7 @@ def _normal_forces(near, gap, stiffness, deepest, stiffening, push):
 
 @njit(**_LOOP)
 def _forces(near, gap, normal, change, stiffness, deepest, stiffening, force):
-    """Fills force (P, 3) of the points that are near, after a change (P, 3)."""
+    """Fill force (P, 3) of the points that are near, after a change (P, 3)."""
     for i in near:
         n = normal[i]
         reached = gap[i] + (n[0] * change[i, 0] + n[1] * change[i, 1] + n[2] * change[i, 2])
@@ -313,7 +324,7 @@ def _forces(near, gap, normal, change, stiffness, deepest, stiffening, force):
 
 @njit(**_LOOP)
 def _slopes(near, gap, normal, change, stiffness, deepest, stiffening, slope):
-    """Fills slope (P,) of the points that are near, after a change (P, 3)."""
+    """Fill slope (P,) of the points that are near, after a change (P, 3)."""
     for i in near:
         n = normal[i]
         reached = gap[i] + (n[0] * change[i, 0] + n[1] * change[i, 1] + n[2] * change[i, 2])
@@ -323,8 +334,10 @@ def _slopes(near, gap, normal, change, stiffness, deepest, stiffening, slope):
 
 
 @njit(**_LOOP)
-def _work(near, gap, normal, start, change, length, stiffness, deepest, stiffening):
-    """The work of pushes along a change (P, 3), after a start and a length of it."""
+def _work(  # noqa: PLR0913
+    near, gap, normal, start, change, length, stiffness, deepest, stiffening
+):
+    """Return the work of pushes along a change (P, 3), after a start and a length of it."""
     total = 0.0
     for i in near:
         n, a, b = normal[i], start[i], change[i]

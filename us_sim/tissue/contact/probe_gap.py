@@ -6,7 +6,8 @@
 >>> gap.round(3), normal
 (array([-0.01]), array([[0., 0., 1.]]))
 >>> probe = FlaredProbe(RoundedBox(0.04, 0.014, 0.03, 0.004), spacing=0.006)
->>> gap, normal = probe.measure_distances(Pose(), np.array([[0.0, 0.0, -0.001], [0.022, 0.0, -0.005]]))
+>>> points = np.array([[0.0, 0.0, -0.001], [0.022, 0.0, -0.005]])
+>>> gap, normal = probe.measure_distances(Pose(), points)
 >>> gap.round(6), normal.round(3)
 (array([-0.001   ,  0.000696]), array([[0.   , 0.   , 1.   ],
        [0.866, 0.   , 0.5  ]]))
@@ -50,7 +51,7 @@ _TRACED = 400  # steps on a point's way in; a grazing one takes many
 
 
 def pushes_only_forward(collider: Collider, spacing: float) -> bool:
-    """Whether the collider pushes with its face alone, not along the normals of its rounding.
+    """Return whether the collider pushes along its face's normal only, not off its rounding.
 
     Surface nodes that are ``spacing`` (m) apart do not see a rounding of less than twice that: one
     by one they would slide off it sideways and the probe would sink in between them, which a
@@ -66,14 +67,14 @@ def measure_gaps(
     spacing: float,
     skirt: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gap between points and the probe, along the direction in which it pushes them.
+    """Measure gaps between points and the probe, along the direction in which it pushes them.
 
-    With a rounding that the points resolve (see `pushes_only_forward`) the gap outside the collider and
-    within half its rounding below the surface is the signed distance, and the direction its normal.
-    Deeper, the nearest surface point is no guide: the normal may point sideways or back. There a
-    point is pushed onto the tangent plane where the probe's +z through it leaves the collider, as
-    if the probe had come down on it. With a smaller rounding every point is pushed along +z onto
-    the surface, or, under a curved face, square to that face.
+    With a rounding that the points resolve (see `pushes_only_forward`) the gap outside the
+    collider and within half its rounding below the surface is the signed distance, and the
+    direction its normal. Deeper, the nearest surface point is no guide: the normal may point
+    sideways or back. There a point is pushed onto the tangent plane where the probe's +z through it
+    leaves the collider, as if the probe had come down on it. With a smaller rounding every point is
+    pushed along +z onto the surface, or, under a curved face, square to that face.
 
     Args:
         collider: the probe's shape; it is taken to go on for 0.1 m behind.
@@ -106,7 +107,7 @@ def measure_gaps(
 def wrench_on_probe(
     pose: Pose, points: NDArray[np.float64], forces: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Reaction of the forces with which the probe pushes tissue.
+    """Return the tissue's reaction to the forces with which the probe pushes it.
 
     Args:
         pose: of the probe.
@@ -130,10 +131,10 @@ def wrench_on_probe(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def pushing_gap(box, forward, skirt, x, y, z):
-    """Gap and push direction for one point of frame ``probe``: (gap, nx, ny, nz).
+    """Return the gap and push direction for one point of frame ``probe``: (gap, nx, ny, nz).
 
-    ``box`` is the collider's ``offset_box``, ``forward`` as `pushes_only_forward` says, and ``skirt`` (m)
-    widens a forward push beyond the rim.
+    ``box`` is the collider's ``offset_box``, ``forward`` the answer of `pushes_only_forward`, and
+    ``skirt`` (m) widens a forward push beyond the rim.
     """
     if len(box) > 4:
         return _curved_pushing_gap(box, forward, skirt, x, y, z)
@@ -161,7 +162,7 @@ def pushing_gap(box, forward, skirt, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _curved_pushing_gap(box, forward, skirt, x, y, z):
-    """As `pushing_gap`, of a box with a curved front."""
+    """Return as `pushing_gap`, for a box with a curved front."""
     rounding, radius = box[3], 1.0 / box[4]
     sx = 1.0 if x >= 0 else -1.0
     sy = 1.0 if y >= 0 else -1.0
@@ -198,7 +199,7 @@ def _curved_pushing_gap(box, forward, skirt, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _pushing_gaps(box, forward, rotation, origin, points, skirt, gap, normal):
-    """Fills gap (N,), normal (N, 3) for points (N, 3) of the probe's parent frame, skirt (N,)."""
+    """Fill gap (N,), normal (N, 3) for points (N, 3) of the probe's parent frame, skirt (N,)."""
     r = rotation
     for i in range(len(points)):
         a = points[i, 0] - origin[0]
@@ -211,7 +212,7 @@ def _pushing_gaps(box, forward, rotation, origin, points, skirt, gap, normal):
 
 
 class FlaredProbe:
-    """The shape with which a probe presses a surface that is coarser than the probe's edges.
+    """Shape with which a probe presses a surface that is coarser than the probe's edges.
 
     It is the collider, with a front that is the collider's own, and flanks that lean outward behind
     it, at 60 degrees to the face, until they are a little wider than the collider; from there they
@@ -246,7 +247,7 @@ class FlaredProbe:
     def measure_distances(
         self, pose: Pose, points: NDArray[np.float64], near: NDArray[np.integer] | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Signed distance of points, and the outward normal of the surface there.
+        """Measure signed distances of points, and the outward normals of the surface there.
 
         Args:
             pose: of the probe in the points' frame.
@@ -263,7 +264,7 @@ class FlaredProbe:
         return gap, normal
 
     def curvature(self, pose: Pose, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(P, 3, 3) 1/m, how the normal turns as points (P, 3) m move."""
+        """Return (P, 3, 3) 1/m, how the normal turns as points (P, 3) m move."""
         turn = np.zeros((len(points), 3, 3))
         _curvatures(self._shape, pose.rotation, np.array(pose.position), points, turn)
         return turn
@@ -271,7 +272,7 @@ class FlaredProbe:
     def find_entry_planes(
         self, last: Pose | None, pose: Pose, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The planes through which points came in as the probe moved from one pose to another.
+        """Find the planes through which points came in as the probe moved to a pose.
 
         Args:
             last: where the probe came from; None: from far behind along its axis.
@@ -293,10 +294,10 @@ class FlaredProbe:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _corner(sine, cosine, flare, beside, ahead):
-    """Distance in a plane to a front that ends at the origin, and the flank behind its end.
+    """Return the distance in a plane to a front that ends at the origin, with a flank behind it.
 
-    The front is where ``ahead`` is zero, the flank at ``beside`` above zero. Returns it, its two
-    slopes, and its curvature (1/m) across them.
+    The front is where ``ahead`` is zero, the flank at ``beside`` above zero. The distance is
+    followed by its two slopes, and its curvature (1/m) across them.
     """
     low = flare * sine / cosine if cosine > 0.0 else 0.0  # how far back the flank leans
     flank, upright = beside * sine + ahead * cosine, beside - flare
@@ -321,7 +322,7 @@ def _corner(sine, cosine, flare, beside, ahead):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _profile(shape, x, z):
-    """Distance to the core in the plane of the image: (distance, its slopes by x and z, 1/m)."""
+    """Return the distance to the core in the image's plane: (distance, slopes by x and z, 1/m)."""
     half, bent = shape[0], shape[4]
     side = 1.0 if x >= 0.0 else -1.0
     ahead = z + shape[3]
@@ -350,7 +351,7 @@ def _profile(shape, x, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _distance(shape, x, y, z):
-    """Distance and normal for one point of frame ``probe``: (distance, nx, ny, nz)."""
+    """Return distance and normal for one point of frame ``probe``: (distance, nx, ny, nz)."""
     if z + shape[3] + shape[2] <= 0.0:
         return math.inf, 0.0, 0.0, 1.0
     across, ux, uz, _ = _profile(shape, x, z)
@@ -361,7 +362,7 @@ def _distance(shape, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _distances(shape, r, origin, points, near, gap, normal):
-    """Fills gap (P,), normal (P, 3) for the points (P, 3) that are near."""
+    """Fill gap (P,), normal (P, 3) for the points (P, 3) that are near."""
     for i in near:
         a = points[i, 0] - origin[0]
         b = points[i, 1] - origin[1]
@@ -373,7 +374,7 @@ def _distances(shape, r, origin, points, near, gap, normal):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _curvatures(shape, r, origin, points, turn):
-    """Fills turn (P, 3, 3), 1/m: the second derivatives of the distance."""
+    """Fill turn (P, 3, 3), 1/m, with the second derivatives of the distance."""
     most = 5.0 / shape[3]
     first, second = np.empty(3), np.empty(3)
     for i in range(len(points)):
@@ -399,7 +400,7 @@ def _curvatures(shape, r, origin, points, turn):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _enter(shape, came, there, gap, normal):
-    """Fills gap (P,) and normal (P, 3) of planes where points enter, all in frame ``probe``."""
+    """Fill gap (P,) and normal (P, 3) of planes where points enter, all in frame ``probe``."""
     for i in range(len(there)):
         wx = there[i, 0] - came[i, 0]
         wy = there[i, 1] - came[i, 1]

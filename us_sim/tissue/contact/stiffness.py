@@ -10,7 +10,8 @@ answer is the compliance between the touched nodes; so the tangent is one small 
 >>> from us_sim.tissue.contact.stiffness import compute_contact_stiffness
 >>> springs = np.eye(3) / 50.0  # m/N, one node
 >>> pressed, force = Pose(position=[0.0, 0.0, 0.01]), np.array([[0.0, 0.0, 0.5]])
->>> stiffness = compute_contact_stiffness(Sphere(0.03), pressed, [[0.0, 0.0, 0.01]], force, springs, 0.02)
+>>> at, probe = [[0.0, 0.0, 0.01]], Sphere(0.03)
+>>> stiffness = compute_contact_stiffness(probe, pressed, at, force, springs, 0.02)
 >>> float(stiffness[2, 2].round(6))  # N/m
 50.0
 """
@@ -39,7 +40,7 @@ def compute_contact_stiffness(
     spacing: float,
     surface: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> NDArray[np.float64]:
-    """The tangent of a frictionless contact on tissue of known compliance.
+    """Compute the tangent of a frictionless contact on tissue of known compliance.
 
     Args:
         collider: the probe's shape.
@@ -49,7 +50,7 @@ def compute_contact_stiffness(
         compliance: (3K, 3K) m/N, between these points.
         spacing: m, between neighbours among the nodes that can be touched.
         surface: (K, 3) directions of the pushes, and (K, 3, 3) 1/m how they turn as the points
-            move, where the probe does not push as `push_out` says.
+            move, where the probe does not push as `measure_gaps` says.
 
     Returns:
         (6, 6) N/m, N, N m: how much the wrench on the probe, force and torque about its origin
@@ -98,7 +99,7 @@ def compute_contact_stiffness(
 def compliance_between(
     compliance: NDArray[np.float64], nodes: NDArray[np.integer]
 ) -> NDArray[np.float64]:
-    """(3K, 3K), the part of a compliance (3S, 3S) that is between the nodes (K,)."""
+    """Return (3K, 3K), the part of a compliance (3S, 3S) that is between the nodes (K,)."""
     rows = (3 * nodes[:, None] + np.arange(3)).ravel()
     return compliance[np.ix_(rows, rows)]
 
@@ -106,8 +107,11 @@ def compliance_between(
 def _surface(
     collider: Collider, pose: Pose, points: NDArray[np.float64], spacing: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """At (K, 3) points: the gap's slope (K, 3), the push's direction (K, 3), and how that turns as
-    the point moves (K, 3, 3) 1/m.
+    """Differentiate gap and push at points (K, 3) m.
+
+    Returns:
+        The gap's slope (K, 3), the push's direction (K, 3), and how that turns as the point moves
+        (K, 3, 3) 1/m.
     """
     count = len(points)
     offsets = np.concatenate([np.zeros((1, 3)), _STEP * np.eye(3), -_STEP * np.eye(3)])
@@ -120,7 +124,7 @@ def _surface(
 
 
 def _cross(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(K, 3, 3) matrices that take any u to vector × u."""
+    """Return (K, 3, 3) matrices that take any u to vector × u."""
     matrices = np.zeros((len(vectors), 3, 3))
     for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         matrices[:, c, b] = vectors[:, a]
@@ -130,5 +134,8 @@ def _cross(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @cache
 def _threads() -> ThreadpoolController:
-    """Finding the libraries takes milliseconds, small systems on several threads far longer."""
+    """Find the BLAS libraries once, which takes milliseconds.
+
+    Small systems take far longer on several threads than on one.
+    """
     return ThreadpoolController()

@@ -4,7 +4,7 @@ They are in the middles of the triangles' parts (`TriangleParts`) and at the nod
 probe can touch, but no triangle's, is a point by itself.
 
 >>> from us_sim.tissue.model import TissueModel
->>> points = SurfacePoints(TissueModel.block((0.1, 0.1, 0.1), (2, 2, 2)), size=0.08)
+>>> points = SurfacePoints(TissueModel.make_block((0.1, 0.1, 0.1), (2, 2, 2)), size=0.08)
 >>> len(points.rest), float(points.spread_to_points(np.ones(8)).sum())  # of the top's four nodes
 (12, 4.0)
 >>> sunk = np.zeros((3, 8))
@@ -56,7 +56,7 @@ tetrahedron resists, so that no probe turns one inside out."""
 
 
 def make_surface_contact(model: TissueModel) -> tuple[SurfacePoints, PenaltyContact]:
-    """Points on the surface of a tissue, and the contact of its probe at these."""
+    """Make points on the surface of a tissue, and the contact of its probe at these."""
     # A lone node has no neighbour to be apart from.
     spacing = model.contact_spacing or float(np.ptp(model.mesh.nodes, axis=0).min())
     points = SurfacePoints(model, choose_part_size(float(model.collider.offset_box[3]), spacing))
@@ -119,12 +119,12 @@ class SurfacePoints:
         self._per_area = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0.0)
 
     def spread_to_points(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(P,), values of nodes (N,) handed to their points by area; the sum is the same."""
+        """Return (P,), values of nodes (N,) handed to their points by area; the sum is the same."""
         density = (self.weights * (values * self._per_area)[self.nodes]).sum(axis=1)
         return np.asarray(self._area * density)
 
     def sum_at_nodes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N, ...), values of points (P, ...) handed to their nodes by weight."""
+        """Return (N, ...), values of points (P, ...) handed to their nodes by weight."""
         total = np.zeros((self._count, *values.shape[1:]))
         for k in range(3):
             weight = self.weights[:, k].reshape(-1, *[1] * (values.ndim - 1))
@@ -137,11 +137,12 @@ class SurfacePoints:
         gap: NDArray[np.float64],
         normal: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """One spring at each node, in place of those of its points.
+        """Merge the springs of points into one spring at each node.
 
         Args:
             stiffness: (P,) N/m; zero where there is none.
-            gap, normal: (P,) m and (P, 3) of the points.
+            gap: (P,) m.
+            normal: (P, 3), direction of the push.
 
         Returns:
             (N,) m, gaps, infinite where there is no spring; (N, 3), their directions; and (N,)
@@ -163,7 +164,7 @@ class SurfacePoints:
     def interpolate_field(
         self, field: NDArray[np.float64], some: NDArray[np.integer] | None = None
     ) -> NDArray[np.float64]:
-        """(P, 3), a field (3, N) at the points; zero where it is not asked for."""
+        """Return (P, 3), a field (3, N) at ``some`` points, zero at others."""
         values = np.zeros((len(self.nodes), 3))
         some = self._all if some is None else some
         _add_at_points(some, self.nodes, self.weights, field, values)
@@ -172,7 +173,7 @@ class SurfacePoints:
     def compute_positions(
         self, displacement: NDArray[np.float64], some: NDArray[np.integer] | None = None
     ) -> NDArray[np.float64]:
-        """(P, 3) m, where points are at a displacement (3, N) m; at rest where it is not asked."""
+        """Return (P, 3) m, ``some`` points at a displacement (3, N) m, others at rest."""
         places: NDArray[np.float64] = self.rest.copy()
         some = self._all if some is None else some
         _add_at_points(some, self.nodes, self.weights, displacement, places)
@@ -190,7 +191,7 @@ class SurfacePoints:
         directions: NDArray[np.float64],
         stiffness: NDArray[np.float64],
     ) -> tuple[NDArray[np.integer], NDArray[np.float64], NDArray[np.float64]]:
-        """Springs of points, each divided among its nodes as if these did not share it.
+        """Divide each point's spring among its nodes, as if these did not share it.
 
         They are about as stiff as the springs of the points together; that is for preconditioners.
 
@@ -213,6 +214,7 @@ class SurfacePoints:
 
 @njit(**_LOOP)
 def _add_at_points(some, nodes, weights, field, values):
+    """Add a field (3, N) at ``some`` points to their values (P, 3)."""
     x, y, z = field[0], field[1], field[2]
     for p in some:
         i, j, k = nodes[p, 0], nodes[p, 1], nodes[p, 2]
@@ -224,6 +226,7 @@ def _add_at_points(some, nodes, weights, field, values):
 
 @njit(**_LOOP)
 def _scatter(some, nodes, weights, vectors, field):
+    """Add vectors (P, 3) of ``some`` points to a field (3, N) at their nodes."""
     for p in some:
         for k in range(3):
             for d in range(3):
@@ -232,7 +235,7 @@ def _scatter(some, nodes, weights, vectors, field):
 
 @njit(**_LOOP)
 def _sum_springs(nodes, weights, stiffness, gap, normal, total):
-    """Adds to total (N, 5) the stiffness of each node's springs, and gaps and normals by that."""
+    """Add to total (N, 5) the stiffness of each node's springs, and gaps and normals by that."""
     for p in range(len(nodes)):
         if stiffness[p] > 0.0:
             for k in range(3):
@@ -246,7 +249,7 @@ def _sum_springs(nodes, weights, stiffness, gap, normal, total):
 
 @njit(**_LOOP)
 def _lump(active, corner, weights, directions, stiffness, tensor):
-    """Adds to tensor (S, 6), xx, xy, xz, yy, yz, zz, what springs are at each node of points."""
+    """Add the springs to their nodes' stiffnesses ``tensor`` (S, 6): xx, xy, xz, yy, yz, zz."""
     for m in range(len(active)):
         x, y, z = directions[m, 0], directions[m, 1], directions[m, 2]
         for k in range(3):
@@ -262,7 +265,7 @@ def _lump(active, corner, weights, directions, stiffness, tensor):
 
 @njit(**_LOOP)
 def _split(own, tensor, movable, nodes, along, firm):
-    """Writes tensors as springs, by Cholesky's method with pivots; returns how many there are."""
+    """Write tensors as springs, by Cholesky's method with pivots; return their number."""
     count = 0
     left = np.empty((3, 3))
     for i in range(len(own)):
@@ -316,7 +319,7 @@ def add_springs(nodes, weights, directions, stiffness, change, image):
 
 @njit(**_LOOP)
 def add_turns(nodes, weights, turn, change, image):
-    """As `add_springs`, for stiffnesses (K, 3, 3) N/m in all directions."""
+    """Add to image as `add_springs`, for stiffnesses (K, 3, 3) N/m in all directions."""
     for p in range(len(nodes)):
         i, j, k = nodes[p, 0], nodes[p, 1], nodes[p, 2]
         for d in range(3):

@@ -24,7 +24,7 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 @lru_cache(maxsize=1)  # a solver asks for those of its mesh several times
 def shape_gradients(mesh: TetrahedralMesh) -> NDArray[np.float64]:
-    """(M, 4, 3) 1/m, gradients of the four linear shape functions of each tetrahedron."""
+    """Return (M, 4, 3) 1/m, gradients of the four linear shape functions of each tetrahedron."""
     corners = mesh.nodes[mesh.tetrahedra]
     inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1])
     gradients = np.empty((len(corners), 4, 3))
@@ -34,7 +34,7 @@ def shape_gradients(mesh: TetrahedralMesh) -> NDArray[np.float64]:
 
 
 def assemble_stiffness(mesh: TetrahedralMesh, materials: TissueMaterials) -> bsr_array:
-    """(3N, 3N) N/m, symmetric, in 3x3 blocks with sorted columns.
+    """Assemble the stiffness (3N, 3N) N/m: symmetric, in 3x3 blocks with sorted columns.
 
     A tetrahedron of volume V couples its nodes a and b by
     V (lambda ga gb' + mu gb ga' + mu (ga . gb) I), with g the shape functions' gradients and lambda
@@ -48,7 +48,7 @@ def assemble_stiffness(mesh: TetrahedralMesh, materials: TissueMaterials) -> bsr
 def assemble_lame_stiffness(
     mesh: TetrahedralMesh, first: NDArray[np.float64], second: NDArray[np.float64]
 ) -> bsr_array:
-    """As `assemble_stiffness`, of Lame's constants lambda and mu (M,) Pa themselves."""
+    """Assemble the stiffness as `assemble_stiffness`, from Lame's constants lambda, mu (M,) Pa."""
     count = len(mesh.nodes)
     first = first * mesh.volumes
     second = second * mesh.volumes
@@ -75,7 +75,7 @@ def assemble_lame_stiffness(
 
 
 def drop_fixed_nodes(matrix: bsr_array, fixed: NDArray[np.bool_]) -> bsr_array:
-    """The stiffness without the rows and columns of fixed (N,) nodes."""
+    """Return the stiffness without the rows and columns of fixed (N,) nodes."""
     rows = np.repeat(np.arange(len(fixed)), np.diff(matrix.indptr))
     kept = ~fixed[rows] & ~fixed[matrix.indices]
     number = np.cumsum(~fixed) - 1
@@ -112,7 +112,7 @@ def require_held(mesh: TetrahedralMesh, fixed: NDArray[np.bool_]) -> None:
 
 
 def nodal_shear_stiffness(mesh: TetrahedralMesh, materials: TissueMaterials) -> NDArray[np.float64]:
-    """(N,) N/m, how firmly each node resists a displacement of itself alone by shear."""
+    """Return (N,) N/m, how firmly each node resists a displacement of itself alone by shear."""
     shear = materials.young_modulus / (2 * (1 + materials.poisson_ratio))
     resists = (shear * mesh.volumes)[:, None] * (shape_gradients(mesh) ** 2).sum(axis=2)
     total = np.zeros(len(mesh.nodes))
@@ -136,14 +136,14 @@ class AveragedPressure:
         return (self.element + self.coupling.T @ (scaled @ self.coupling)).tocsr()
 
     def compute_forces(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N, 3, ...) N, external forces that hold the nodes at displacements (N, 3, ...) m."""
+        """Return (N, 3, ...) N, external forces that hold nodes at displacements (N, 3, ...) m."""
         moved = displacement.reshape(3 * len(displacement), -1)
         pressure = (self.coupling @ moved) / self.capacity[:, None]
         held = self.element @ moved + self.coupling.T @ pressure
         return held.reshape(displacement.shape)
 
     def restrict_to(self, nodes: NDArray[np.integer]) -> AveragedPressure:
-        """The equations of some nodes (K,), where the others stay."""
+        """Return the equations of some nodes (K,); all others stay."""
         kept = (3 * nodes[:, None] + np.arange(3)).ravel()
         # Rows of numbers are faster than blocks for many displacements at once.
         element, coupling = self.element.tocsr()[kept][:, kept], self.coupling[:, kept]

@@ -142,6 +142,6 @@ _WORDS = {
 
 
 def guess_tissue_kind(name: str) -> str:
-    """The kind of tissue that a structure's name says: of several known words the last one."""
+    """Guess the kind of tissue from a structure's name; of several known words the last counts."""
     words = [word for word in re.split(r"[^a-z]+", name.lower()) if word in _WORDS]
     return _WORDS[words[-1]] if words else next(iter(KINDS))

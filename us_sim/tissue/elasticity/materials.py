@@ -71,7 +71,7 @@ class TissueMaterials:
 
 
 def make_uniform_materials(mesh: TetrahedralMesh, material: Material) -> TissueMaterials:
-    """The same material everywhere."""
+    """Give all tetrahedra the same material."""
     count = len(mesh.tetrahedra)
     pressure = material.lumen_pressure
     return TissueMaterials(
@@ -90,14 +90,14 @@ class LabelFractions(NamedTuple):
     fractions: NDArray[np.float64]  # (M, L) of the volume; rows sum to 1
 
     def for_label(self, label: int) -> NDArray[np.float64]:
-        """(M,) those of one label, zero where it does not occur."""
+        """Return (M,) fractions of one label, zero where it does not occur."""
         return self.fractions[:, self.labels == label].sum(axis=1)
 
 
 def label_fractions(
     mesh: TetrahedralMesh, labels: NDArray[np.uint8], index_from_patient: NDArray[np.float64]
 ) -> LabelFractions:
-    """The volume fraction of each label in each tetrahedron.
+    """Measure the volume fraction of each label in each tetrahedron.
 
     The same 1024 low-discrepancy points (Kronecker sequence of the generalised golden ratio, mapped
     to the simplex by sorting) are looked up in every tetrahedron, so that a tetrahedron smaller
@@ -138,13 +138,14 @@ def label_fractions(
 def average_over_labels(
     fractions: LabelFractions, materials: Mapping[int, Material]
 ) -> TissueMaterials:
-    """Constants of each tetrahedron: the average of its labels' constants by volume fraction.
+    """Average the constants of each tetrahedron's labels by volume fraction.
 
     Args:
-        materials: of each label that occurs in them.
+        fractions: of each label in each tetrahedron.
+        materials: of each label that occurs.
 
     Raises:
-        MaterialError: a label in them has no material.
+        MaterialError: a label that occurs has no material.
     """
     missing = [int(label) for label in fractions.labels if int(label) not in materials]
     if missing:
@@ -171,7 +172,7 @@ def average_over_labels(
 
 
 def _simplex_points(count: int) -> NDArray[np.float64]:
-    """(count, 4) barycentric coordinates spread evenly over a tetrahedron.
+    """Return (count, 4) barycentric coordinates spread evenly over a tetrahedron.
 
     Points of the unit cube from M. Roberts' R3 sequence; the gaps between the sorted coordinates
     of a uniform point are uniform on the simplex (Devroye 1986, V.3).
@@ -184,7 +185,7 @@ def _simplex_points(count: int) -> NDArray[np.float64]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _count_labels(indices, tetrahedra, labels, points):
-    """(M, 256) int32: in how many points (P, 4) of each tetrahedron each label is found.
+    """Return (M, 256), the number of points (P, 4) of each tetrahedron in each label.
 
     indices (N, 3) are the nodes' voxel indices, labels (i, j, k).
     """

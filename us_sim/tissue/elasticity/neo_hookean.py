@@ -8,8 +8,7 @@ resists the average change of volume around each node:
 
 with c = V nodal / 4, plus the term against being crushed. Tetrahedra with a lumen have its energy
 in place of all but the shear's. Without them, linearised at rest, it is linear elasticity with the
-same split. Kernels gather nodes into
-rows of `LANES` tetrahedra, whose loops LLVM vectorises.
+same split. Kernels gather nodes into rows of `LANES` tetrahedra, whose loops LLVM vectorises.
 """
 
 from __future__ import annotations
@@ -79,7 +78,7 @@ _ENERGY = OUT + 12  # Row of energies, behind those of forces
 
 @njit(**INLINED)
 def _nodal_pressure(lanes, constants, w):
-    """The nodal weight times the sum of the nodes' values that `gather_scalar` has made."""
+    """Return the nodal weight times the sum of the nodes' values that `gather_scalar` has made."""
     v = SUMS * LANES + w
     first, second = lanes[v] + lanes[v + LANES], lanes[v + 2 * LANES] + lanes[v + 3 * LANES]
     return constants[_NODAL * LANES + w] * (first + second)
@@ -87,7 +86,7 @@ def _nodal_pressure(lanes, constants, w):
 
 @njit(**INLINED)
 def _pressure(h, lanes, rows, w):
-    """V times the slope by J of all energy but the shear's and lumens'."""
+    """Return V times the slope by J of all energy but the shear's and lumens'."""
     change = volume_change(h)
     own = rows[_ELEMENT * LANES + w] * change + rows[_WALL * LANES + w] * barrier_term(change)[1]
     return own + _nodal_pressure(lanes, rows, w)
@@ -246,7 +245,7 @@ def _diagonal_blocks(nodes, constants, tangent, lanes, blocks):
 def make_tetrahedra_sums(
     mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLike
 ) -> NodalSums:
-    """Energies, forces and their slopes of the tetrahedra of any mesh, summed at the nodes."""
+    """Make the sums over the tetrahedra of any mesh at its nodes."""
     made = neo_hookean_constants(mesh, materials)
     rows = np.empty((len(mesh.tetrahedra), _CONSTANTS))
     rows[:, SHAPE:_SHEAR] = shape_gradients(mesh)[:, 1:].reshape(-1, 9)
@@ -308,19 +307,19 @@ class NeoHookean:
         self.linearise(np.zeros((3, self.count), dtype=self.dtype))
 
     def compute_energy(self, displacement: NDArray) -> float:
-        """J, summed in double precision."""
+        """Return the energy in J, summed in double precision."""
         return self.compute_energy_and_forces(
             displacement, np.empty(displacement.shape, self.dtype)
         )
 
     def compute_forces(self, displacement: NDArray, out: NDArray | None = None) -> NDArray:
-        """(3, N) N, the slope of the energy: external forces that hold the nodes there."""
+        """Return (3, N) N, the slope of the energy: external forces that hold the nodes there."""
         out = np.empty(displacement.shape, self.dtype) if out is None else out
         self.compute_energy_and_forces(displacement, out)
         return out
 
     def compute_energy_and_forces(self, displacement: NDArray, out: NDArray) -> float:
-        """The energy, J, and its slope (3, N) N, which overwrites ``out``."""
+        """Return the energy in J; overwrite ``out`` with its slope (3, N) N."""
         self._require(displacement)
         self._require(out)
         sums, energy = self._sums, 0.0
@@ -346,7 +345,7 @@ class NeoHookean:
         sums.linearise(displacement, self._nodal, *arrays)
 
     def tangent_product(self, change: NDArray, out: NDArray | None = None) -> NDArray:
-        """(3, N) N, the slope of the forces times a change (3, N) of the displacement."""
+        """Return (3, N) N, the slope of the forces times a change (3, N) of the displacement."""
         self._require(change)
         out = np.empty_like(change) if out is None else out
         self._require(out)
@@ -359,7 +358,7 @@ class NeoHookean:
         return out
 
     def diagonal_blocks(self) -> NDArray:
-        """(6, N) N/m, the entries xx, xy, xz, yy, yz, zz of each node's block of the tangent.
+        """Return (6, N) N/m, entries xx, xy, xz, yy, yz, zz of each node's block of the tangent.
 
         The nodal part of the bulk stiffness is counted as it is at rest.
         """
@@ -370,11 +369,11 @@ class NeoHookean:
         return blocks
 
     def smallest_volume_ratio(self, displacement: NDArray) -> float:
-        """The smallest J, a tetrahedron's volume over its volume at rest; NaN if any J is NaN."""
+        """Return the smallest J, a tetrahedron's volume over that at rest; NaN if any is NaN."""
         return self._volume_ratios(displacement)[0]
 
     def count_inverted(self, displacement: NDArray) -> int:
-        """How many tetrahedra have a J that is not above zero."""
+        """Count the tetrahedra whose J is not above zero."""
         return self._volume_ratios(displacement)[1]
 
     def _volume_ratios(self, displacement: NDArray) -> tuple[float, int]:
@@ -395,7 +394,7 @@ class NeoHookean:
 
 
 def _nodal_blocks(mesh: TetrahedralMesh, weight: NDArray, total: NDArray) -> NDArray:
-    """(6, N) N/m, the diagonal blocks at rest of the nodal part of the bulk stiffness.
+    """Return (6, N) N/m, the diagonal blocks at rest of the nodal part of the bulk stiffness.
 
     Node n meets the average of each neighbour a, and its own, through s(a, n), the sum of c g over
     the tetrahedra of both, g being n's shape gradient there; its block is the sum over a of

@@ -84,7 +84,7 @@ def copy_in(values, grid, first, rows, lanes, row, step):
 
 @njit(**INLINED)
 def add_out(lanes, row, step, grid, first, rows, values):
-    """The reverse of `copy_in`: add rows to the values (N,) at the corners of cells."""
+    """Add rows to the values (N,) at the corners of cells: the reverse of `copy_in`."""
     count = min(LANES, grid[3] - first)
     for yz in range(4):
         start = first + (yz // 2) * grid[1] + (yz % 2)
@@ -132,7 +132,7 @@ def _corners(field, w):
 
 @njit(**INLINED)
 def _corner_gradient(x0, x1, y0, y1, z0, z1, g):
-    """The gradient at a corner, of a field at the lower and upper ends of its three edges."""
+    """Return the gradient at a corner, of a field at the two ends of each of its three edges."""
     return (
         (x1[0] - x0[0]) * g[0],
         (y1[0] - y0[0]) * g[1],
@@ -148,7 +148,7 @@ def _corner_gradient(x0, x1, y0, y1, z0, z1, g):
 
 @njit(**INLINED)
 def _middle_gradient(b, c, e, h, g):
-    """The gradient in the tetrahedron between the corners 1, 2, 4 and 7."""
+    """Return the gradient in the tetrahedron between the corners 1, 2, 4 and 7."""
     i, j, k = HALF * g[0], HALF * g[1], HALF * g[2]
     return (
         ((e[0] - b[0]) + (h[0] - c[0])) * i,
@@ -165,7 +165,7 @@ def _middle_gradient(b, c, e, h, g):
 
 @njit(**INLINED)
 def gradients(field, rows, w):
-    """The gradients in the five tetrahedra of a cell."""
+    """Return the gradients in the five tetrahedra of a cell."""
     a, b, c, d, e, f, g, h = _corners(field, w)
     per = get_three(rows, PER_WIDTH, w)
     return (
@@ -178,8 +178,10 @@ def gradients(field, rows, w):
 
 
 @njit(**INLINED)
-def _corner_forces(px, py, pz, qx, qy, qz, rx, ry, rz, sx, sy, sz, tx, ty, tz, g):
-    """Along one axis, the forces at the eight corners of rows of five stresses times volumes."""
+def _corner_forces(  # noqa: PLR0913
+    px, py, pz, qx, qy, qz, rx, ry, rz, sx, sy, sz, tx, ty, tz, g
+):
+    """Return forces along one axis at the eight corners, of rows of five stresses times volumes."""
     px, py, pz = px * g[0], py * g[1], pz * g[2]
     qx, qy, qz = qx * g[0], qy * g[1], qz * g[2]
     rx, ry, rz = rx * g[0], ry * g[1], rz * g[2]
@@ -199,7 +201,7 @@ def _corner_forces(px, py, pz, qx, qy, qz, rx, ry, rz, sx, sy, sz, tx, ty, tz, g
 
 @njit(**INLINED)
 def _put_eight(values, lanes, row, step, w):
-    """Fill rows row + step * corner."""
+    """Fill rows row + step * corner with eight values."""
     v, d = row * LANES + w, step * LANES
     lanes[v] = values[0]
     lanes[v + d] = values[1]
@@ -239,7 +241,7 @@ def put_volumes(p, q, r, s, t, w, lanes):
 
 @njit(**INLINED)
 def put_sum(a, b, c, d, lanes, row, w):
-    """Six rows from ``row`` on: the sum of four blocks."""
+    """Fill six rows from ``row`` on with the sum of four blocks."""
     total = (
         (a[0] + b[0]) + (c[0] + d[0]),
         (a[1] + b[1]) + (c[1] + d[1]),
@@ -278,7 +280,7 @@ def add_lumens(field, rows, lumen, entry, row, lanes):
 
 @njit(**LOOP)
 def _nodal_pressures(nodal, grid, first, rows, lanes):
-    """Fill rows from PRESSURES on: each tetrahedron's nodal weight times its nodes' sum."""
+    """Fill rows from PRESSURES on with each tetrahedron's nodal weight times its nodes' sum."""
     copy_in(nodal, grid, first, rows, lanes, SUMS, SCALAR)
     for w in range(LANES):
         v = SUMS * LANES + w
@@ -297,7 +299,7 @@ def _nodal_pressures(nodal, grid, first, rows, lanes):
 
 @njit(**INLINED)
 def _pressure(h, element, wall, nodal):
-    """V times the slope by J of all energy but the shear's; nodal is the nodes' part of it."""
+    """Return V times the slope by J of all energy but the shear's; ``nodal`` is the nodes' part."""
     change = volume_change(h)
     return element * change + nodal + wall * barrier_term(change)[1]
 
@@ -309,7 +311,7 @@ def _tetrahedron_stress(h, shear, element, wall, nodal):
 
 @njit(**INLINED)
 def _count(ratio, least, count):
-    """The least ratio so far, NaN if any was, and how many were not above zero."""
+    """Return the least ratio so far, NaN if any was, and how many were not above zero."""
     least = ratio if ratio < least or np.isnan(ratio) else least
     return least, count if ratio > 0 else count + ONE
 
@@ -500,7 +502,7 @@ def _tangent_product(change, nodal, grid, constants, tangent, lanes, product):
 
 @njit(**INLINED)
 def _corner_blocks(h, i, j, k, shear, bulk):
-    """Blocks of a corner tetrahedron: at its corner, and at the ends of its edges along x, y, z.
+    """Return blocks of a corner tetrahedron: of its corner, and of its edges' ends along x, y, z.
 
     i, j and k are the shape gradient of its corner.
     """
@@ -552,7 +554,7 @@ def _diagonal_blocks(grid, constants, tangent, lanes, blocks):
 def make_cell_sums(
     mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLike
 ) -> NodalSums:
-    """Energies, forces and their slopes of every tetrahedron of a box mesh, summed at the nodes."""
+    """Make the sums over the tetrahedra of a box mesh at its nodes."""
     assert mesh.planes is not None
     shape = tuple(len(planes) for planes in mesh.planes)
     widths = [np.diff(planes) for planes in mesh.planes]

@@ -82,7 +82,7 @@ _BARRIER_ONSET, _CRUSHED = np.float32(0.25), np.float32(0.02)
 
 @njit(**INLINED)
 def inner_product(a, b):
-    """The sum of the products of the entries of two matrices."""
+    """Return the sum of the products of the entries of two matrices."""
     return (
         (a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
         + (a[3] * b[3] + a[4] * b[4] + a[5] * b[5])
@@ -92,7 +92,7 @@ def inner_product(a, b):
 
 @njit(**INLINED)
 def cofactor_change(h):
-    """cof(I + h) - I; cof F is the derivative of det F."""
+    """Return cof(I + h) - I; cof F is the derivative of det F."""
     xx, xy, xz, yx, yy, yz, zx, zy, zz = h
     return (
         (yy * zz - yz * zy) + (yy + zz),
@@ -109,7 +109,7 @@ def cofactor_change(h):
 
 @njit(**INLINED)
 def cofactor_slope(h, d):
-    """The change of cof(I + h) for a small change d of h."""
+    """Return the change of cof(I + h) for a small change d of h."""
     xx, xy, xz, yx, yy, yz, zx, zy, zz = h
     dxx, dxy, dxz, dyx, dyy, dyz, dzx, dzy, dzz = d
     return (
@@ -127,7 +127,7 @@ def cofactor_slope(h, d):
 
 @njit(**INLINED)
 def _volume_change_beyond_trace(h):
-    """det(I + h) - 1 - trace h."""
+    """Return det(I + h) - 1 - trace h."""
     xx, xy, xz, yx, yy, yz, zx, zy, zz = h
     first = yy * zz - yz * zy
     return (
@@ -140,14 +140,15 @@ def _volume_change_beyond_trace(h):
 
 @njit(**INLINED)
 def volume_change(h):
-    """J - 1, that is det(I + h) - 1."""
+    """Return J - 1, that is det(I + h) - 1."""
     return (h[0] + h[4] + h[8]) + _volume_change_beyond_trace(h)
 
 
 @njit(**INLINED)
 def barrier_from(change, onset):
-    """The term against being crushed that begins at J = onset, over its modulus, and its two slopes
-    by J = change + 1.
+    """Return the barrier term that begins at J = onset, and its two slopes by J = change + 1.
+
+    All are over the modulus of the wall.
     """
     ratio = ONE + change
     held = _CRUSHED if ratio < _CRUSHED else ratio
@@ -169,13 +170,13 @@ def barrier_from(change, onset):
 
 @njit(**INLINED)
 def barrier_term(change):
-    """The barrier of solid tissue, and its first and second slope by the change of volume."""
+    """Return the barrier of solid tissue, and its two slopes by the change of volume."""
     return barrier_from(change, _BARRIER_ONSET)
 
 
 @njit(**INLINED)
 def energy_density(h, shear, bulk, wall):
-    """The energy density above."""
+    """Return the energy density that the module's docstring states."""
     beyond = _volume_change_beyond_trace(h)
     change = (h[0] + h[4] + h[8]) + beyond
     plain = shear * (HALF * inner_product(h, h) - beyond) + HALF * (bulk * change * change)
@@ -184,7 +185,10 @@ def energy_density(h, shear, bulk, wall):
 
 @njit(**INLINED)
 def piola_stress(h, shear, pressure):
-    """First Piola-Kirchhoff stress mu F + (p - mu) cof F; p is the other energy's slope by J."""
+    """Return the first Piola-Kirchhoff stress mu F + (p - mu) cof F.
+
+    p is the slope by J of the energy without the shear's.
+    """
     c = cofactor_change(h)
     k = pressure - shear
     return (
@@ -202,7 +206,7 @@ def piola_stress(h, shear, pressure):
 
 @njit(**INLINED)
 def _stress_slope(h, c, d, shear, k, rise):
-    """The change of the stress for a small change d of h.
+    """Return the change of the stress for a small change d of h.
 
     c is cof(I + h) - I, k = p - mu and rise the change of p.
     """
@@ -222,19 +226,19 @@ def _stress_slope(h, c, d, shear, k, rise):
 
 @njit(**INLINED)
 def volume_slope(h, d):
-    """The change of J for a small change d of h."""
+    """Return the change of J for a small change d of h."""
     return inner_product(cofactor_change(h), d) + (d[0] + d[4] + d[8])
 
 
 @njit(**INLINED)
 def bulk_slope(change, element, wall):
-    """How fast the pressure rises with J = change + 1: by element, and against being crushed."""
+    """Return the rise of the pressure with J = change + 1: by element, and by the barrier."""
     return element + wall * barrier_term(change)[2]
 
 
 @njit(**INLINED)
 def stress_rise(h, d, shear, bulk, k, nodal):
-    """The change of the stress for a small change d of h and a change nodal of the mean pressure.
+    """Return the change of the stress for small changes d of h, and nodal of the mean pressure.
 
     bulk is the `bulk_slope` at h, and k is p - mu.
     """
@@ -245,7 +249,7 @@ def stress_rise(h, d, shear, bulk, k, nodal):
 
 @njit(**INLINED)
 def diagonal_block(g, c, shear, bulk):
-    """(xx, xy, xz, yy, yz, zz) of mu g.g I + bulk (cof F g)(cof F g)', c being cof F - I.
+    """Return mu g.g I + bulk (cof F g)(cof F g)' as (xx, xy, xz, yy, yz, zz); c is cof F - I.
 
     This is how a node with the shape gradient g resists its own displacement; the rest of the
     stress does not contribute.
@@ -270,7 +274,7 @@ _FIRMNESS = 5.0
 def barrier_modulus(
     tetrahedra: NDArray[np.integer], shear: NDArray[np.float64], count: int
 ) -> NDArray[np.float64]:
-    """(M,) Pa, of the wall of each tetrahedron.
+    """Return (M,) Pa, the modulus of each tetrahedron's wall.
 
     Args:
         tetrahedra: (M, 4) node indices.
@@ -281,7 +285,7 @@ def barrier_modulus(
 
 
 def barrier_strength(mesh: TetrahedralMesh, materials: TissueMaterials) -> NDArray[np.float64]:
-    """(N,) N, a measure of the force that the walls around each node withstand.
+    """Return (N,) N, a measure of the force that the walls around each node withstand.
 
     It is the sum, over the tetrahedra at the node, of shear modulus times a third of a face, where
     none counts as stiffer than the weakest wall there: a stiff tetrahedron bears more, but a soft
@@ -299,7 +303,7 @@ def barrier_strength(mesh: TetrahedralMesh, materials: TissueMaterials) -> NDArr
 
 
 def _mean_with_stiffest(tetrahedra: NDArray, shear: NDArray, count: int) -> NDArray:
-    """(M,) Pa, geometric mean of a tetrahedron's shear modulus and the largest around it."""
+    """Return (M,) Pa, geometric means of each shear modulus and the largest around it."""
     around = np.zeros(count)
     np.maximum.at(around, tetrahedra, np.broadcast_to(shear[:, None], tetrahedra.shape))
     return np.asarray(np.sqrt(shear * around[tetrahedra].max(axis=1)))
@@ -336,14 +340,14 @@ class NeoHookeanConstants:
     lumen: NDArray[np.float64]  # (M, CONSTANTS), see `lumen_table`; zero where there is none
 
     def lumen_energies(self, mesh: TetrahedralMesh) -> NDArray[np.float64]:
-        """(M, CONSTANTS), for energies in J where ``lumen`` is for their densities."""
+        """Return (M, CONSTANTS), for energies in J; ``lumen`` is for their densities."""
         energies = self.lumen.copy()
         energies[:, [0, 4]] *= mesh.volumes[:, None]
         return energies
 
 
 def neo_hookean_constants(mesh: TetrahedralMesh, materials: TissueMaterials) -> NeoHookeanConstants:
-    """The constants of solids, and of lumens where materials have them.
+    """Return the constants of solids, and of lumens where materials have them.
 
     A tetrahedron with a lumen takes no part in the averages of `volumetric_split`, so that it may
     lose its volume whatever its neighbours do.
@@ -360,7 +364,7 @@ def neo_hookean_constants(mesh: TetrahedralMesh, materials: TissueMaterials) -> 
 
 
 def _drained_fraction(materials: TissueMaterials) -> NDArray[np.float64]:
-    """(M,), fraction of each tetrahedron that may leave it, somewhat more than that of its lumen.
+    """Return (M,), the fraction of each tetrahedron that may leave it, above that of its lumen.
 
     A tetrahedron's contents move as one. So of the lumen f in one that loses f of its volume,
     f (1 - f) would stay to be seen: of the arm's vein, whose tetrahedra are almost as large as it
@@ -375,8 +379,10 @@ def lumen_table(
     bulk: NDArray[np.float64],
     wall: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """(M, CONSTANTS): p (Pa), a = (1 - f) p / K, b = f e, 1 / (2 a + b), the modulus of the wall
-    (Pa), and the volume ratio at which it begins; zero where there is no lumen.
+    """Return (M, CONSTANTS), each lumen's law; zero where there is no lumen.
+
+    The columns are p (Pa), a = (1 - f) p / K, b = f e, 1 / (2 a + b), the modulus of the wall
+    (Pa), and the volume ratio at which it begins.
 
     Args:
         fraction: (M,), f.
@@ -411,7 +417,7 @@ def require_solid(mesh: TetrahedralMesh, materials: TissueMaterials) -> None:
 
 @njit(**INLINED)
 def lumen_energy(change, constants):
-    """Energy density of a tetrahedron with lumen, its slope by J = change + 1 and that one's.
+    """Return the energy density of a tetrahedron with lumen, and its two slopes by J = change + 1.
 
     With s = m - 1, the quadratic equation is a s^2 + (2 a + b) s = J - 1.
     """

@@ -1,10 +1,10 @@
 """Sums of a neo-Hookean material over tetrahedra at their nodes, sixty-four tetrahedra at a time.
 
 Row r of a buffer begins at r * `LANES` and holds one number a cell or tetrahedron. The functions
-are inlined into the loops that call them, so that the row is a constant there. `make_cell_sums` are for
-the cells of a box mesh, `make_tetrahedra_sums` for any mesh; `NeoHookean` adds the nodal averages.
-Lumens, which most groups have none of, are added in loops of their own, so that a tissue without
-vessels takes no longer.
+are inlined into the loops that call them, so that the row is a constant there. `make_cell_sums` is
+for the cells of a box mesh, `make_tetrahedra_sums` for any mesh; `NeoHookean` adds the nodal
+averages. Most groups have no lumens; these are added in loops of their own, so that a tissue
+without vessels takes no longer.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LANES = 64
 
 
 def pack_lanes(table: NDArray) -> NDArray:
-    """(chunks, R * LANES) from (M, R): one row after the other of LANES lines of the table."""
+    """Pack (M, R) as (chunks, R * LANES): one row after the other of LANES lines of the table."""
     chunks = -(-len(table) // LANES)
     padded = np.zeros((chunks * LANES, table.shape[1]), dtype=table.dtype)
     padded[: len(table)] = table
@@ -33,21 +33,21 @@ def pack_lanes(table: NDArray) -> NDArray:
 
 @njit(**INLINED)
 def get_three(rows, row, w):
-    """Three rows from ``row`` on: a vector."""
+    """Return three rows from ``row`` on: a vector."""
     v = row * LANES + w
     return rows[v], rows[v + LANES], rows[v + 2 * LANES]
 
 
 @njit(**INLINED)
 def get_five(rows, row, w):
-    """Five rows from ``row`` on, of the five tetrahedra of a cell."""
+    """Return five rows from ``row`` on, of the five tetrahedra of a cell."""
     v = row * LANES + w
     return (rows[v], rows[v + LANES], rows[v + 2 * LANES], rows[v + 3 * LANES], rows[v + 4 * LANES])
 
 
 @njit(**INLINED)
 def get_nine(rows, row, w):
-    """Nine rows from ``row`` on: a matrix, row by row."""
+    """Return nine rows from ``row`` on: a matrix, row by row."""
     v = row * LANES + w
     return (
         rows[v],
@@ -64,7 +64,7 @@ def get_nine(rows, row, w):
 
 @njit(**INLINED)
 def put_six(values, rows, row, w):
-    """Fill six rows from ``row`` on: a symmetric matrix, xx, xy, xz, yy, yz, zz."""
+    """Fill six rows from ``row`` on with a symmetric matrix: xx, xy, xz, yy, yz, zz."""
     v = row * LANES + w
     rows[v] = values[0]
     rows[v + LANES] = values[1]
@@ -76,7 +76,7 @@ def put_six(values, rows, row, w):
 
 @njit(**INLINED)
 def put_nine(values, rows, row, w):
-    """Fill nine rows from ``row`` on: a matrix, row by row."""
+    """Fill nine rows from ``row`` on with a matrix, row by row."""
     v = row * LANES + w
     rows[v] = values[0]
     rows[v + LANES] = values[1]
@@ -140,7 +140,7 @@ def scatter_scalar(lanes, nodes, values):
 
 @njit(**INLINED)
 def gradient(field, constants, w):
-    """The gradient of the field whose rows `gather_vector` has made."""
+    """Return the gradient of the field whose rows `gather_vector` has made."""
     x0, y0, z0 = get_three(field, FIELD, w)
     x1, y1, z1 = get_three(field, FIELD + 3, w)
     x2, y2, z2 = get_three(field, FIELD + 6, w)
@@ -164,7 +164,10 @@ def gradient(field, constants, w):
 
 @njit(**INLINED)
 def _put_row(px, py, pz, constants, w, lanes, row):
-    """Along the axis of ``row``, the force of the stress's row times volume at all four nodes."""
+    """Fill rows ``row`` + 3 b with the force at node b along one axis.
+
+    (px, py, pz) is that axis' row of stress times volume.
+    """
     a0, a1, a2, b0, b1, b2, c0, c1, c2 = get_nine(constants, SHAPE, w)
     a = px * a0 + py * a1 + pz * a2
     b = px * b0 + py * b1 + pz * b2
@@ -213,12 +216,15 @@ class NodalSums(NamedTuple):
 
 
 def pack_groups(table: NDArray, dtype: DTypeLike) -> tuple[NDArray[np.int32], NDArray]:
-    """(C,) which row of the other array each group of `LANES` lines has, or -1 if it has no lumen;
-    and (L, CONSTANTS * K * LANES) the constants of those that have one.
+    """Pack the lumens of the groups of `LANES` lines that have any.
 
     Args:
         table: (R, K, CONSTANTS), volumes times those of `lumen_table`, of K tetrahedra a line.
         dtype: of the constants.
+
+    Returns:
+        (C,) the row of each group in the second array, -1 if it has no lumen; and
+        (L, CONSTANTS * K * LANES) the constants of those that have one.
     """
     groups = -(-len(table) // LANES)
     padded = np.zeros((groups * LANES, *table.shape[1:]))
@@ -232,7 +238,7 @@ def pack_groups(table: NDArray, dtype: DTypeLike) -> tuple[NDArray[np.int32], ND
 
 @njit(**INLINED)
 def lumen_energy_at(h, lumen, v, step):
-    """`lumen_energy` times volume; the tetrahedron's constants are at v and ``step`` apart."""
+    """Return `lumen_energy` times volume; the constants are at v and ``step`` apart."""
     return lumen_energy(
         volume_change(h),
         (

@@ -49,7 +49,7 @@ class SpringNetwork:
     def compute_forces(
         self, positions: NDArray[np.float64], velocity: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """(N, 3) N on the nodes, for positions (N, 3) m and velocities (N, 3) m/s."""
+        """Return (N, 3) N on the nodes, for positions (N, 3) m and velocities (N, 3) m/s."""
         force = np.empty_like(positions)
         spring_forces(
             self.arrays, np.ascontiguousarray(positions), np.ascontiguousarray(velocity), force
@@ -57,17 +57,14 @@ class SpringNetwork:
         return force
 
     def drop_fixed(self, fixed: NDArray[np.bool_]) -> SpringNetwork:
-        """The network without the springs between two fixed nodes, which have no effect."""
+        """Return the network without springs between two fixed nodes, which have no effect."""
         kept = ~fixed[self.edges].all(axis=1)
         return SpringNetwork(
-            self.edges[kept],
-            self.stiffness[kept],
-            self.damping[kept],
-            self.rest_length[kept],
+            self.edges[kept], self.stiffness[kept], self.damping[kept], self.rest_length[kept]
         )
 
     def factor_stiffness(self, nodes: NDArray[np.float64]) -> csr_array:
-        """B (E, 3N), (N/m)^0.5, such that B'B is the stiffness around unstretched ``nodes``."""
+        """Return B (E, 3N), (N/m)^0.5; B'B is the stiffness around unstretched ``nodes``."""
         along = nodes[self.edges[:, 1]] - nodes[self.edges[:, 0]]
         along *= (np.sqrt(self.stiffness) / np.linalg.norm(along, axis=1))[:, None]
         count = len(self.edges)
@@ -83,9 +80,11 @@ def build_springs(
     stiffness_factor: float = 0.002,
     damping_factor: float = 0.1,
 ) -> SpringNetwork:
-    """The paper's Algorithm 1: all edges of all tetrahedra become springs, duplicates merge.
+    """Make springs of all edges of all tetrahedra; duplicates merge (the paper's Algorithm 1).
 
     Args:
+        mesh: of the tissue.
+        materials: of its tetrahedra.
         stiffness_factor: m, spring constant over Young's modulus, for one tetrahedron's edge. The
             paper gives it as a bare number, but it is a length: the right one grows with the mesh's
             spacing, as `fit_springs` shows.
@@ -97,7 +96,7 @@ def build_springs(
 def fit_springs(
     mesh: TetrahedralMesh, materials: TissueMaterials, damping_factor: float = 0.1
 ) -> SpringNetwork:
-    """Springs as stiff as the linear elasticity of the same mesh, whatever its spacing.
+    """Make springs as stiff as the linear elasticity of the same mesh, whatever its spacing.
 
     Equal springs k along a tetrahedron's six edges of lengths L store sum(k L**2) e**2 / 2 in a
     swelling by the strain e, a material with lambda = mu stores 15 mu V e**2 / 2; averaged over
@@ -109,6 +108,8 @@ def fit_springs(
     6 V / sum(L**2).
 
     Args:
+        mesh: of the tissue.
+        materials: of its tetrahedra.
         damping_factor: s, damping constant over spring constant.
     """
     ends = mesh.nodes[mesh.tetrahedra][:, _CORNERS]
@@ -118,7 +119,7 @@ def fit_springs(
 
 
 def _network(mesh: TetrahedralMesh, stiffness: NDArray, damping_factor: float) -> SpringNetwork:
-    """Six equal springs of stiffness (M,) N/m in each tetrahedron; duplicates merge."""
+    """Make six equal springs of stiffness (M,) N/m in each tetrahedron; duplicates merge."""
     merged = np.zeros(len(mesh.edges))
     np.add.at(merged, _edges_of_tetrahedra(mesh), stiffness[:, None])
     rest_length = np.empty(len(mesh.edges))
@@ -135,7 +136,7 @@ def _edges_of_tetrahedra(mesh: TetrahedralMesh) -> NDArray[np.intp]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _lengths(edges, nodes, length):
-    """Fills length (E,), rounded as in `spring_forces`, so that nothing pulls at rest."""
+    """Fill length (E,), rounded as in `spring_forces`, so that nothing pulls at rest."""
     for e in range(len(edges)):
         x = nodes[edges[e, 1], 0] - nodes[edges[e, 0], 0]
         y = nodes[edges[e, 1], 1] - nodes[edges[e, 0], 1]
@@ -145,7 +146,7 @@ def _lengths(edges, nodes, length):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def spring_forces(springs, positions, velocity, force):
-    """Fills force (N, 3) with the paper's eq. (1), along each spring, on both its nodes.
+    """Fill force (N, 3) with the paper's eq. (1), along each spring, on both its nodes.
 
     It is fastest with edges in the order of their first nodes, whose numbers then stay in
     registers.

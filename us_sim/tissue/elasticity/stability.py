@@ -28,7 +28,7 @@ _TOLERANCE = 1e-4  # relative, of the square of the highest frequency
 
 
 def step_limit(frequency: float, damping_factor: float) -> float:
-    """s, the longest stable step of symplectic Euler for stiffness-proportional damping.
+    """Return the longest stable step (s) of symplectic Euler for stiffness-proportional damping.
 
     Args:
         frequency: the highest one, 1/s.
@@ -41,7 +41,7 @@ def step_limit(frequency: float, damping_factor: float) -> float:
 def highest_frequency(
     factor: csr_array, mass: NDArray[np.float64], fixed: NDArray[np.bool_]
 ) -> float:
-    """1/s, the largest circular frequency of small undamped oscillations.
+    """Return the largest circular frequency (1/s) of small undamped oscillations.
 
     By Lanczos iterations on the largest generalised eigenvalue of stiffness and mass, to 1e-4.
 
@@ -64,7 +64,7 @@ def highest_frequency(
 
 
 def bound_node_stiffness(factor: csr_array) -> NDArray[np.float64]:
-    """(N,) N/m, d such that the stiffness is nowhere above 2 diag(d) (S. Gershgorin's bound).
+    """Return (N,) N/m, d such that the stiffness is nowhere above 2 diag(d) (Gershgorin's bound).
 
     It is the sum of a node's spring constants, which holds however they turn and stretch, and about
     2.7 times the bound that the undeformed tissue needs.
@@ -87,10 +87,10 @@ def stabilise(
     stabilisation: str,
     maximum_substeps: int,
 ) -> tuple[NDArray[np.float64], int, str]:
-    """Masses (N,) kg and number of sub-steps that make a step stable, and a remark on them.
+    """Choose masses and sub-steps that make a step stable.
 
-    They follow from the bound of `bound_node_stiffness`, so that the step stays stable as the tissue
-    deforms. The limit in the remark is that of small oscillations.
+    They follow from `bound_node_stiffness`, so that the step stays stable as the tissue deforms.
+    The limit in the remark is that of small oscillations.
 
     Args:
         model: whose lumped masses are simulated where possible.
@@ -98,6 +98,10 @@ def stabilise(
         time_step: s, as set.
         damping_factor: s, damping constant over stiffness.
         stabilisation: ``mass_scaling``, ``substeps``, or ``none``, which only adds the remark.
+        maximum_substeps: the most that are allowed.
+
+    Returns:
+        Masses (N,) kg, the number of sub-steps, and a remark on them.
 
     Raises:
         SolverError: more sub-steps than allowed.
@@ -149,7 +153,7 @@ class InversionWatch:
         self._frames_free = 0
 
     def check_frame(self, positions: NDArray[np.float64], touched: bool) -> tuple[int, bool]:
-        """How many are inside out after a frame, and whether to put the tissue back to rest.
+        """Count tetrahedra inside out after a frame; decide whether to put the tissue to rest.
 
         Args:
             positions: (N, 3) m.
@@ -162,7 +166,10 @@ class InversionWatch:
 
 
 def select_watched_tetrahedra(model: TissueModel) -> NDArray[np.int32]:
-    """(W, 4), where a press turns tetrahedra inside out first: all, or those under the surface."""
+    """Select the tetrahedra (W, 4) to watch: all, or in a large mesh those under the surface.
+
+    A press turns those inside out first.
+    """
     tetrahedra = model.mesh.tetrahedra
     if len(tetrahedra) <= _WATCHED:
         return tetrahedra
@@ -176,7 +183,7 @@ def select_watched_tetrahedra(model: TissueModel) -> NDArray[np.int32]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def count_inverted(nodes, tetrahedra):
-    """How many tetrahedra (M, 4) have no positive volume."""
+    """Count the tetrahedra (M, 4) without a positive volume."""
     count = 0
     for t in range(len(tetrahedra)):
         a, b, c, d = tetrahedra[t, 0], tetrahedra[t, 1], tetrahedra[t, 2], tetrahedra[t, 3]
@@ -207,7 +214,7 @@ class ElasticResidual:
 
     @classmethod
     def for_springs(cls, springs: SpringNetwork, nodes: NDArray[np.float64]) -> ElasticResidual:
-        """The residual of springs that are undeformed at nodes (N, 3) m."""
+        """Make the residual of springs that are undeformed at nodes (N, 3) m."""
         stiffness = float(np.linalg.norm(springs.stiffness))
         return cls(4 * float(np.finfo(np.float64).eps * np.abs(nodes).max()) * stiffness)
 
@@ -221,7 +228,7 @@ class ElasticResidual:
         touched: NDArray[np.integer],
         normal: NDArray[np.float64],
     ) -> float:
-        """The residual of one frame.
+        """Compute the residual of one frame.
 
         Args:
             elastic: (N, 3) N that would hold the nodes where they are, nothing at fixed ones.

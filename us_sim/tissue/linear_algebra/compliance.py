@@ -47,10 +47,12 @@ class DenseFields:
     def compute_at(
         cls, nodes: NDArray[np.integer], forces: int, solve: Solve, precision: type
     ) -> DenseFields:
-        """The fields at ``nodes`` (F,) of forces on S nodes.
+        """Compute the fields at ``nodes`` (F,) of forces on S nodes.
 
         Args:
-            solve: the (N, 3, 3K) m/N fields of unit forces on K of the S nodes.
+            nodes: (F,), at which fields are kept.
+            forces: S.
+            solve: returns the (N, 3, 3K) m/N fields of unit forces on K of the S nodes.
             precision: of the numbers to keep.
         """
         fields: NDArray[np.floating] = np.empty((3 * forces, 3, len(nodes)), precision)
@@ -151,7 +153,7 @@ class SurfaceCompliance:
         self._add_surface(forces, self._places[1], displacement)
 
     def compute_displacement(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N, 3) m, the displacement of every node by forces (S, 3) N."""
+        """Return (N, 3) m, the displacement of every node by forces (S, 3) N."""
         displacement = np.zeros((self.count, 3))
         self.fields.add_displacement(forces.ravel(), displacement)
         self._add_surface(forces, self._places[0], displacement)
@@ -171,7 +173,7 @@ class SurfaceCompliance:
         _add_rows(columns, rows, forces.ravel()[rows], places, displacement.reshape(-1, 1))
 
     def compute_imbalance(self, forces: NDArray[np.float64]) -> float:
-        """The norm of the unbalanced force in the field of forces (S, 3) N, over that of these."""
+        """Return the norm of the unbalanced force in the field of forces (S, 3) N, over theirs."""
         if len(self.gram) == 0:
             return self.rounding
         rows = np.flatnonzero(forces)
@@ -191,8 +193,9 @@ def compute_compliance(
     fixed and contact nodes.
 
     Args:
+        model: of the tissue and the probe.
         progress: called with the fraction done and a label, if it takes a second or more.
-        has_error: whether `SurfaceCompliance.compute_imbalance` is asked for, a fifth of the work.
+        has_error: whether `SurfaceCompliance.compute_imbalance` is needed, a fifth of the work.
 
     Raises:
         SolverError: the tissue is not held, its moduli are too different, or the fields do not fit
@@ -212,7 +215,7 @@ def compute_compliance(
 
 
 def compute_loaded_displacement(model: TissueModel) -> NDArray[np.float64]:
-    """(N, 3) m, of linear tissue under the model's own load, without a probe.
+    """Return (N, 3) m, the displacement of linear tissue by the model's own load, without a probe.
 
     Raises:
         SolverError: the tissue is not held, or its moduli are too different.
@@ -277,7 +280,7 @@ def _compute(
 
 
 def _memory() -> float:
-    """Bytes of this machine's memory; no limit where the system does not say."""
+    """Return the bytes of this machine's memory; infinite where the system does not say."""
     if not hasattr(os, "sysconf"):
         return math.inf
     return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
@@ -286,7 +289,7 @@ def _memory() -> float:
 def _gram(
     made: SurfaceCompliance, found: DenseFields, system: AveragedPressure, fixed: NDArray
 ) -> NDArray[np.float32]:
-    """(3S, 3S), products of the unbalanced forces in the fields of two unit forces."""
+    """Return (3S, 3S), products of the unbalanced forces in the fields of two unit forces."""
     size, free = len(made.matrix), np.flatnonzero(~fixed)
     system, place = system.restrict_to(free), np.cumsum(~fixed) - 1
     loaded = (3 * place[made.nodes][:, None] + np.arange(3)).ravel()
@@ -305,8 +308,9 @@ def _gram(
 def _rounding(
     made: SurfaceCompliance, points: NDArray, system: AveragedPressure, fixed: NDArray
 ) -> float:
-    """The unbalanced force over the norm of the forces: the median of single ones and of presses,
-    whichever is larger.
+    """Measure the unbalanced force over the norm of the forces.
+
+    It is the median of single forces or of presses, whichever is larger.
     """
     random = np.random.Generator(np.random.PCG64(0))
     medians = []

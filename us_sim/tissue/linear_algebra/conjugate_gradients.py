@@ -11,7 +11,7 @@ from us_sim.kernels import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def product_rows(start, columns, blocks, vector, rows):
-    """(len(rows), 3) those block rows of the matrix times vector (N, 3)."""
+    """Return (len(rows), 3), those block rows of the matrix times vector (N, 3)."""
     product = np.empty((len(rows), 3))
     for k in range(len(rows)):
         x = y = z = 0.0
@@ -42,7 +42,7 @@ def _project(vector, touched, normal):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _multiply(start, columns, blocks, vector, product):
-    """product (N, 3) = matrix in 3x3 blocks times vector (N, 3); returns vector . product."""
+    """Fill product (N, 3) with the matrix in 3x3 blocks times vector; return vector . product."""
     energy = 0.0
     for i in range(len(vector)):
         x = y = z = 0.0
@@ -63,7 +63,7 @@ def _multiply(start, columns, blocks, vector, product):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _precondition(preconditioner, residual, scaled):
-    """scaled (N, 3) = preconditioner (N, 3, 3) times residual (N, 3); returns r.z and r.r."""
+    """Fill scaled with preconditioner (N, 3, 3) times residual (N, 3); return r.z and r.r."""
     slope = 0.0
     square = 0.0
     for i in range(len(residual)):
@@ -83,7 +83,7 @@ def _precondition(preconditioner, residual, scaled):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def conjugate_gradients(
+def conjugate_gradients(  # noqa: PLR0913
     start, columns, blocks, preconditioner, touched, normal, displacement, residual, direction,
     product, slope, norm, iterations, target,
 ):  # fmt: skip
@@ -97,9 +97,7 @@ def conjugate_gradients(
     """
     if slope < 0.0:
         _multiply(start, columns, blocks, displacement, residual)
-        for i in range(len(residual)):
-            for axis in range(3):
-                residual[i, axis] = -residual[i, axis]
+        residual[:] = -residual
         _project(residual, touched, normal)
         slope, square = _precondition(preconditioner, residual, direction)
         norm = math.sqrt(square)
@@ -111,11 +109,7 @@ def conjugate_gradients(
         if not energy > 0.0:
             return -1.0, before, norm
         _project(product, touched, normal)
-        step = slope / energy
-        for i in range(len(displacement)):
-            for axis in range(3):
-                displacement[i, axis] += step * direction[i, axis]
-                residual[i, axis] -= step * product[i, axis]
+        _advance(slope / energy, direction, product, displacement, residual)
         last = slope
         slope, square = _precondition(preconditioner, residual, product)
         norm = math.sqrt(square)
@@ -126,3 +120,12 @@ def conjugate_gradients(
             for axis in range(3):
                 direction[i, axis] = product[i, axis] + turn * direction[i, axis]
     return slope, before, norm
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _advance(step, direction, product, displacement, residual):
+    """Move the displacement by step times direction; update the residual by its product."""
+    for i in range(len(displacement)):
+        for axis in range(3):
+            displacement[i, axis] += step * direction[i, axis]
+            residual[i, axis] -= step * product[i, axis]

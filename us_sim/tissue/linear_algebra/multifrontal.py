@@ -41,7 +41,7 @@ class DissectionPart:
 def nested_dissection(
     points: NDArray[np.float64], edges: NDArray[np.integer], largest: int = 60
 ) -> DissectionPart:
-    """The tree of parts.
+    """Dissect a mesh into the tree of its parts.
 
     Args:
         points: (N, 3) m, by whose coordinates nodes are halved.
@@ -115,7 +115,7 @@ class EliminatedMesh:
     _precision: type
 
     def compute_fields(self, nodes: NDArray[np.integer]) -> NDArray[np.floating]:
-        """(N, 3, 3K) m/N, displacements by a unit force along each axis at each of nodes (K,).
+        """Return (N, 3, 3K) m/N, displacements by a unit force along each axis at nodes (K,).
 
         The nodes are among those that `eliminate` was told; column 3 k + axis is of node k.
         """
@@ -125,13 +125,13 @@ class EliminatedMesh:
         return self._solve(fields)
 
     def compute_displacement(self, load: NDArray[np.float64]) -> NDArray[np.floating]:
-        """(N, 3) m, displacement by forces (N, 3) N on nodes that `eliminate` was told."""
+        """Return (N, 3) m, the displacement by forces (N, 3) N on nodes that `eliminate` knows."""
         right: NDArray[np.floating] = np.zeros((self._unknowns, 1), self._precision)
         right[: 3 * self._nodes, 0] = load.ravel()
         return self._solve(right)[:, :, 0]
 
     def _solve(self, fields: NDArray[np.floating]) -> NDArray[np.floating]:
-        """(N, 3, K) m, displacements by forces (unknowns, K), which are overwritten."""
+        """Return (N, 3, K) m, displacements by forces (unknowns, K), which are overwritten."""
         loaded = np.asarray(fields.any(axis=1))
         for front in self._fronts:
             if front.inverse is not None and loaded[front.own].any():
@@ -156,10 +156,12 @@ def eliminate(
     """Eliminate all nodes.
 
     Args:
+        mesh: of the tissue.
+        system: its equations.
         fixed: (N,), nodes that stay; enough to make the stiffness positive definite.
         loaded: (K,) nodes that are not fixed, on which there will be forces.
-        precision: of the numbers that say how parts follow.
-        report: told the fraction of the arithmetic done.
+        precision: of the stored responses.
+        report: called with the fraction of the arithmetic done.
 
     Raises:
         SolverError: to rounding, the stiffness is not positive definite.
@@ -214,7 +216,7 @@ class _Elimination:
         self._eliminate(root)
 
     def _unknowns(self, nodes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Displacements and pressures of nodes, each ascending."""
+        """Return the displacements and the pressures of nodes, each ascending."""
         free = nodes[self._free[nodes]]
         moves = (3 * free[:, None] + np.arange(3)).ravel()
         return moves, self._pressure[nodes[self._pressed[nodes]]]
@@ -225,7 +227,7 @@ class _Elimination:
         return size * float(size + around) ** 2 + sum(self._work(below) for below in part.parts)
 
     def _eliminate(self, part: DissectionPart) -> _Update:
-        """Eliminate a part and those below it; returns the Schur complement around it."""
+        """Eliminate a part and those below it; return the Schur complement around it."""
         updates = [self._eliminate(below) for below in part.parts]
         moves, presses = self._unknowns(part.own)
         own = np.concatenate([moves, presses])
@@ -254,7 +256,7 @@ class _Elimination:
     def _assembled(
         self, own: NDArray, around: NDArray, updates: list[_Update]
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """The blocks own-own, own-around and around-around, with the updates from below."""
+        """Assemble the blocks own-own, own-around and around-around; add the updates from below."""
         stiffness = np.zeros((len(own), len(own)))
         side = np.zeros((len(own), len(around)))
         left = np.zeros((len(around), len(around)))
@@ -283,8 +285,14 @@ class _Factor:
     def condensed(
         self, side: NDArray[np.float64], left: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """How own unknowns follow those around, coupled by ``side``, and the Schur complement that
-        is made of ``left``.
+        """Condense the own unknowns out.
+
+        Args:
+            side: coupling of the own unknowns to those around.
+            left: block of those around, overwritten.
+
+        Returns:
+            The response of the own unknowns to those around, and the Schur complement.
         """
         upper, lower = self._halves(side)
         left -= upper.T @ upper
@@ -294,7 +302,7 @@ class _Factor:
         return response, left
 
     def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Own unknowns under forces on them, those around at rest."""
+        """Solve for the own unknowns under forces on them; those around are at rest."""
         return self._rest(*self._halves(right))
 
     def _halves(self, right: NDArray) -> tuple[NDArray, NDArray]:
@@ -329,8 +337,9 @@ def _backward(factor: NDArray[np.float64], right: NDArray[np.float64]) -> NDArra
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _assemble(stiffness, side, own, start, columns, values, position):
-    """Adds the rows ``own`` of a sparse matrix to stiffness, and to side where the position of a
-    column is after the own ones.
+    """Add the rows ``own`` of a sparse matrix to stiffness and side.
+
+    Columns whose position is after the own ones are added to side.
     """
     for row in range(len(own)):
         for entry in range(start[own[row]], start[own[row] + 1]):
@@ -343,7 +352,7 @@ def _assemble(stiffness, side, own, start, columns, values, position):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _extend_add(stiffness, side, left, update, index):
-    """Adds update (r, r) to the rows and columns ``index``: own ones first, then those around."""
+    """Add update (r, r) to the rows and columns ``index``: own ones first, then those around."""
     own = len(stiffness)
     for i in range(len(index)):
         row = index[i]

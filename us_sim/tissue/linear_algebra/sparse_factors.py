@@ -65,8 +65,16 @@ class FactoredStiffness:
         normals: NDArray[np.floating],
         stiffness: NDArray[np.floating],
     ) -> bool:
-        """Factor the stiffness at a displacement (3, N) m, with springs at ``nodes`` (K,) along
-        ``normals`` (K, 3) of ``stiffness`` (K,) N/m; returns whether it is regular to rounding.
+        """Factor the stiffness at a displacement, with springs.
+
+        Args:
+            displacement: (3, N) m.
+            nodes: (K,), of the springs.
+            normals: (K, 3), their directions.
+            stiffness: (K,) N/m.
+
+        Returns:
+            Whether the matrix is regular to rounding.
         """
         matrix = self._assembled(displacement.astype(np.float64))
         unknown = 3 * self._number[nodes][:, None] + np.arange(3)
@@ -113,7 +121,7 @@ class FactoredStiffness:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _wall_slopes(change, modulus):
-    """(M,) how fast the walls' pressures rise with the volume ratio 1 + change."""
+    """Return (M,), how fast the walls' pressures rise with the volume ratio 1 + change."""
     slopes = np.empty_like(change)
     for e in range(len(change)):
         slopes[e] = modulus[e] * barrier_term(change[e])[2]
@@ -122,7 +130,7 @@ def _wall_slopes(change, modulus):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _lumen_slopes(change, table):
-    """(L,) how fast the pressures of lumens rise with the volume ratio 1 + change."""
+    """Return (L,), how fast the pressures of lumens rise with the volume ratio 1 + change."""
     slopes = np.empty_like(change)
     for e in range(len(change)):
         p, a, b, per, wall, onset = table[e]

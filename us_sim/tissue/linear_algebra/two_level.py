@@ -39,6 +39,7 @@ class CoarseGrid:
     Woodbury, Inverting modified matrices, 1950).
 
     Args:
+        mesh: of the tissue.
         fixed: (N,), nodes that do not move.
         product: K times a field (3, N), with the fixed nodes' rows left in.
         dtype: in which it is applied.
@@ -123,7 +124,7 @@ class CoarseGrid:
 
 
 def _interpolation(nodes: NDArray, free: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Grid cell (N,), grid nodes (N, 8) numbered without unused ones, and weights (N, 8)."""
+    """Return grid cells (N,), grid nodes (N, 8) numbered without gaps, and weights (N, 8)."""
     low, extent = nodes.min(axis=0), np.ptp(nodes, axis=0)
     wanted = max(min(_MOST_NODES, len(nodes) // _SPARSEST), 8)
     spacing = extent.max()
@@ -151,7 +152,7 @@ def _interpolation(nodes: NDArray, free: NDArray) -> tuple[NDArray, NDArray, NDA
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _restrict(field, node, start, corner, weight, coarse):
-    """coarse (3G,) = P' field (3, N)."""
+    """Set coarse (3G,) to P' field (3, N)."""
     coarse[:] = 0
     sums = np.empty((3, 8), field.dtype)
     x, y, z = field[0], field[1], field[2]
@@ -184,7 +185,7 @@ def _restrict(field, node, start, corner, weight, coarse):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _prolong(coarse, node, start, corner, across, room, field):
-    """field (3, N) += P coarse (3G,); across (8, F) are P's weights, room (3, F) is for sums."""
+    """Add P coarse (3G,) to field (3, N); across (8, F) are P's weights, room (3, F) for sums."""
     for c in range(len(corner)):
         near = corner[c]
         first, end = start[c], start[c + 1]
@@ -214,7 +215,10 @@ def _prolong(coarse, node, start, corner, across, room, field):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _respond(inverse, corner, weight, normal, softness, response, factor):
-    """The grid's responses (K, 3G) to unit normal forces, and the Cholesky factor of theirs."""
+    """Fill the grid's responses (K, 3G) to unit normal forces, and a Cholesky factor (K, K).
+
+    The factor is of the responses along the normals, raised by softness (K,).
+    """
     count = len(corner)
     for k in range(count):
         row = response[k]
@@ -227,30 +231,58 @@ def _respond(inverse, corner, weight, normal, softness, response, factor):
                     for j in range(len(row)):
                         row[j] += s * r[j]
     for k in range(count):
-        row = response[k]
         for m in range(k + 1):
-            total = 0.0
-            for q in range(8):
-                g = 3 * corner[m, q]
-                for d in range(3):
-                    total += weight[m, q] * normal[m, d] * row[g + d]
-            factor[k, m] = total
+            factor[k, m] = _move_along(corner[m], weight[m], normal[m], response[k])
         factor[k, k] += softness[k]
-    for k in range(count):
-        for m in range(k + 1):
-            total = factor[k, m]
-            for j in range(m):
-                total -= factor[k, j] * factor[m, j]
-            factor[k, m] = np.sqrt(total) if k == m else total / factor[m, m]
+    _factorise(factor)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _correct(
+def _factorise(matrix):
+    """Overwrite the lower triangle of a matrix (K, K) with its Cholesky factor."""
+    for k in range(len(matrix)):
+        for m in range(k + 1):
+            total = matrix[k, m]
+            for j in range(m):
+                total -= matrix[k, j] * matrix[m, j]
+            matrix[k, m] = np.sqrt(total) if k == m else total / matrix[m, m]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _correct(  # noqa: PLR0913
     inverse, node, start, corner, weight, across, room, touched_corner, touched_weight, normal,
     response, factor, right, solution, force, correction,
 ):  # fmt: skip
-    """correction (3, N) += the constrained grid's answer to force (3, N)."""
+    """Add the constrained grid's answer to force (3, N) to correction (3, N)."""
     _restrict(force, node, start, corner, weight, right)
+    _multiply(inverse, right, solution)
+    count = len(touched_corner)
+    push = np.empty(count)
+    for k in range(count):
+        push[k] = _move_along(touched_corner[k], touched_weight[k], normal[k], solution)
+    _solve_factored(factor, push)
+    for k in range(count):
+        s = inverse.dtype.type(push[k])
+        row = response[k]
+        for j in range(len(right)):
+            solution[j] -= s * row[j]
+    _prolong(solution, node, start, corner, across, room, correction)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _move_along(corner, weight, normal, coarse):
+    """Return the movement along normal (3,) of a node with weights (8,) at grid nodes (8,)."""
+    total = 0.0
+    for q in range(8):
+        g = 3 * corner[q]
+        for d in range(3):
+            total += weight[q] * normal[d] * coarse[g + d]
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _multiply(inverse, right, solution):
+    """Set solution (3G,) to the symmetric inverse (3G, 3G) times right (3G,)."""
     solution[:] = 0
     size = len(right)
     whole = size // 4 * 4
@@ -270,14 +302,14 @@ def _correct(
         ra = inverse[i]
         for j in range(size):
             solution[j] += a * ra[j]
-    count = len(touched_corner)
-    push = np.empty(count)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _solve_factored(factor, push):
+    """Overwrite push (K,) with the solution for it by a Cholesky factor (K, K)."""
+    count = len(push)
     for k in range(count):
-        total = 0.0
-        for q in range(8):
-            g = 3 * touched_corner[k, q]
-            for d in range(3):
-                total += touched_weight[k, q] * normal[k, d] * solution[g + d]
+        total = push[k]
         for j in range(k):
             total -= factor[k, j] * push[j]
         push[k] = total / factor[k, k]
@@ -286,12 +318,6 @@ def _correct(
         for j in range(k + 1, count):
             total -= factor[j, k] * push[j]
         push[k] = total / factor[k, k]
-    for k in range(count):
-        s = inverse.dtype.type(push[k])
-        row = response[k]
-        for j in range(size):
-            solution[j] -= s * row[j]
-    _prolong(solution, node, start, corner, across, room, correction)
 
 
 Product = Callable[[NDArray[np.floating], NDArray[np.floating]], Any]
@@ -342,7 +368,7 @@ class TwoLevel:
         normals: NDArray[np.float64],
         stiffness: NDArray[np.float64],
     ) -> None:
-        """Set the matrix.
+        """Set the blocks of the stiffness, and the springs.
 
         Args:
             blocks: (6, N) N/m, xx, xy, xz, yy, yz, zz of each node's block of the stiffness.
@@ -387,6 +413,7 @@ def conjugate_gradients(
 
     Args:
         product: writes the stiffness, without springs, times its first argument into the second.
+        preconditioner: of the stiffness with springs.
         residual: (3, N), zero at fixed nodes; overwritten with the remaining one.
         iterations: the most products.
         tolerance: norm of the residual at which to end.
@@ -416,7 +443,7 @@ def conjugate_gradients(
 def largest_local_eigenvalue(
     blocks: NDArray[np.floating], product: Product, fixed: NDArray[np.integer]
 ) -> float:
-    """The largest of a stiffness without springs, preconditioned by its blocks (6, N) N/m alone."""
+    """Return the largest eigenvalue of a stiffness preconditioned by its blocks (6, N) N/m."""
     local = TwoLevel(None, fixed, 1.0)
     local.set_matrix(blocks, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
     vector = np.random.default_rng(0).standard_normal((3, blocks.shape[1]))
@@ -435,7 +462,7 @@ def largest_local_eigenvalue(
 
 @njit(**_LOOP)
 def _invert_blocks(blocks, scale, fixed, nodes, normals, springs, own, inverse):
-    """Inverse of each block with its springs, times scale; fills own (K,), n' D n of the blocks."""
+    """Invert each block with its springs, times scale; fill own (K,) with n' D n of the blocks."""
     for i in range(blocks.shape[1]):
         _invert(blocks[:, i], scale, inverse[:, i])
     one = np.empty(6, blocks.dtype)
@@ -536,7 +563,7 @@ def _dot(a, b):
 
 @njit(**_LOOP)
 def _turn(residual, conditioned, before, search):
-    """Update the search direction from the preconditioned residual; returns r . z.
+    """Update the search direction from the preconditioned residual; return r . z.
 
     ``before`` is the last step's r . z, or zero in the first.
     """
@@ -552,14 +579,14 @@ def _turn(residual, conditioned, before, search):
 
 @njit(**_LOOP)
 def _curvature(search, whole, fixed):
-    """The product along the search direction, with the fixed nodes' rows left out."""
+    """Return the product along the search direction, with the fixed nodes' rows left out."""
     clear_nodes(whole, fixed)
     return _dot(search, whole)
 
 
 @njit(**_LOOP)
 def _advance(length, search, elastic, whole, solution, image, residual):
-    """One step along the search direction; returns the squared residual norm."""
+    """Take a step along the search direction; return the squared residual norm."""
     s = search.dtype.type(length)
     total = 0.0
     for d in range(3):

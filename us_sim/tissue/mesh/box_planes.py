@@ -34,10 +34,11 @@ class DesiredSpacing:
 def fit_planes(
     wanted: Sequence[DesiredSpacing], nodes: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Mesh planes (m, ascending) of x, y and z, from the first edge to the last of each.
+    """Fit mesh planes (m, ascending) of x, y and z, from the first edge to the last of each.
 
     Args:
-        nodes: that the box has at most.
+        wanted: spacing along x, y and z.
+        nodes: the most that the box may have.
 
     Raises:
         MeshError: so few nodes make no box.
@@ -61,13 +62,15 @@ def fit_planes(
 def spacing_under_probe(
     wanted: Sequence[DesiredSpacing], half_length: float, half_width: float
 ) -> tuple[DesiredSpacing, DesiredSpacing, DesiredSpacing]:
-    """The desired spacing, lowered to the one that the probe's edges need.
+    """Lower the desired spacing to what the probe's edges need.
 
     Under the probe, at the surface, that is half of the probe's half width; it grows with depth
     and beside the probe.
 
     Args:
-        half_length, half_width: m, of the probe's footprint, along x and y.
+        wanted: spacing along x, y and z.
+        half_length: m, of the probe's footprint along x.
+        half_width: m, along y.
     """
     least = _UNDER_PROBE * half_width
     found = []
@@ -80,7 +83,7 @@ def spacing_under_probe(
 
 
 def _smoothed(axis: DesiredSpacing) -> NDArray[np.float64]:
-    """The wanted spacing, lowered where it would grow faster than `_GROWTH` from a neighbour's."""
+    """Return the spacing, lowered where it would grow faster than `_GROWTH` from a neighbour's."""
     spacing = axis.spacing.astype(np.float64)
     steps = _GROWTH * np.diff((axis.edges[1:] + axis.edges[:-1]) / 2)
     for i in range(1, len(spacing)):
@@ -91,7 +94,7 @@ def _smoothed(axis: DesiredSpacing) -> NDArray[np.float64]:
 
 
 def _spread(axis: DesiredSpacing, count: int) -> NDArray[np.float64]:
-    """``count`` planes with as much of the wanted number of cells between each two."""
+    """Return ``count`` planes with equal parts of the wanted number of cells between them."""
     passed = np.concatenate([[0.0], np.cumsum(np.diff(axis.edges) / axis.spacing)])
     planes = np.interp(np.linspace(0.0, passed[-1], count), passed, axis.edges)
     planes[0], planes[-1] = axis.edges[0], axis.edges[-1]
@@ -111,7 +114,7 @@ def spacing_by_labels(
     counted: Collection[int] | None = None,
     aside: float = math.inf,
 ) -> tuple[DesiredSpacing, DesiredSpacing, DesiredSpacing]:
-    """The spacing along x, y and z that the structures in a box need.
+    """Find the spacing along x, y and z that the structures in a box need.
 
     At each place along an axis it is a third of the thickness of the thinnest structure there,
     which is the median, over the structure's part of that cross-section, of how far it goes on
@@ -142,7 +145,7 @@ def spacing_by_labels(
 
 
 def _sampled(labels: NDArray, index_from_patient: NDArray, centres: list[NDArray]) -> NDArray:
-    """Labels at a grid of points in ``patient``; 0 beyond the volume."""
+    """Return the labels at a grid of points in ``patient``; 0 beyond the volume."""
     x, y, z = np.meshgrid(*centres, indexing="ij", sparse=True)
     inside = np.ones([len(c) for c in centres], dtype=bool)
     flat = np.zeros(inside.shape, dtype=np.int64)
@@ -156,7 +159,7 @@ def _sampled(labels: NDArray, index_from_patient: NDArray, centres: list[NDArray
 
 
 def _thickness(grid: NDArray, axis: int, edges: NDArray) -> NDArray:
-    """(S,) m, of the thinnest structure at each place along an axis of a label grid."""
+    """Return (S,) m, of the thinnest structure at each place along an axis of a label grid."""
     lines = np.moveaxis(grid, axis, 0).reshape(grid.shape[axis], -1)
     ends = np.ones((len(lines) + 1, lines.shape[1]), dtype=bool)
     ends[1:-1] = lines[1:] != lines[:-1]

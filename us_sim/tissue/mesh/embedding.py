@@ -42,6 +42,7 @@ def locate_points(mesh: TetrahedralMesh, points: NDArray[np.float64]) -> MeshLoc
     """Find each point's tetrahedron, or the one whose face on the boundary is nearest to it.
 
     Args:
+        mesh: at rest.
         points: (P, 3) m.
 
     Raises:
@@ -83,16 +84,19 @@ def locate_points(mesh: TetrahedralMesh, points: NDArray[np.float64]) -> MeshLoc
 
 
 def _cells(points, lower, per_cell, shape):
-    """(P, 3) the grid cell of each point, the outermost for those beyond."""
+    """Return (P, 3), the grid cell of each point, the outermost for those beyond."""
     return np.clip(((points - lower) * per_cell).astype(np.int64), 0, shape - 1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _members(first, last, shape):
-    """The tetrahedra that may reach into each cell, as lists one after the other.
+    """List the tetrahedra that may reach into each cell, cell after cell.
 
-    Args:
-        first, last: (M, 3) the lowest and highest cell of each tetrahedron.
+    ``first`` and ``last`` (M, 3) are the lowest and highest cell of each tetrahedron in a grid of
+    ``shape``.
+
+    Returns:
+        (cells + 1,) the start of each cell's list, and the lists.
     """
     starts = np.zeros(shape[0] * shape[1] * shape[2] + 1, dtype=np.int64)
     for counting in (True, False):
@@ -116,7 +120,7 @@ def _members(first, last, shape):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _find(points, cells, starts, members, shape, origins, gradients):
-    """(P,) the tetrahedron that a point is deepest in, -1 where it is in none."""
+    """Return (P,), the tetrahedron that a point is deepest in, -1 where it is in none."""
     found = np.full(len(points), -1, dtype=np.int32)
     for p in range(len(points)):
         cell = (cells[p, 0] * shape[1] + cells[p, 1]) * shape[2] + cells[p, 2]
@@ -141,11 +145,10 @@ def _find(points, cells, starts, members, shape, origins, gradients):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _nearest_triangle(points, faces, sides, middles, radii):
-    """(P,) the nearest triangle to each of points (P, 3), and (P,) its distance.
+    """Return (P,), the nearest triangle to each of points (P, 3), and (P,) m, its distance.
 
-    Args:
-        faces: (T, 3, 3) corners. sides: (T, 2, 3) from the first to the others.
-        middles, radii: (T, 3) and (T,) of a sphere around each.
+    Triangles have corners ``faces`` (T, 3, 3) and ``sides`` (T, 2, 3) from the first to the others;
+    ``middles`` (T, 3) and ``radii`` (T,) are of a sphere around each.
     """
     nearest = np.zeros(len(points), dtype=np.int64)
     distance = np.empty(len(points))
@@ -168,7 +171,7 @@ def _nearest_triangle(points, faces, sides, middles, radii):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _distance_to_triangle(p, a, ab, ac):
-    """Distance, by the region of the triangle's plane that p projects to (Ericson 2005, 5.1.5)."""
+    """Return the distance, by the region of the plane that p projects to (Ericson 2005, 5.1.5)."""
     d1 = 0.0
     d2 = 0.0
     bb = 0.0
@@ -249,7 +252,7 @@ class EmbeddedSurface:
     def embed_trimmed(
         cls, mesh: TetrahedralMesh, vertices: NDArray[np.float64], triangles: NDArray[np.integer]
     ) -> EmbeddedSurface:
-        """The part of a surface that the mesh can carry, its vertices renumbered in order.
+        """Embed the part of a surface that the mesh can carry; vertices are renumbered in order.
 
         Raises:
             MeshError: the arrays are no surface, or no whole triangle of it is in the mesh.
@@ -280,11 +283,10 @@ class EmbeddedSurface:
     def deform(
         self, nodes: NDArray[np.floating]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Where the surface is when the mesh's nodes are at ``nodes`` (N, 3), m.
+        """Deform the surface with the mesh, whose nodes are at ``nodes`` (N, 3) m.
 
         Returns:
-            (V, 3) m vertices and (V, 3) unit normals, as
-            `compute_vertex_normals` says.
+            (V, 3) m vertices and (V, 3) unit normals, as `compute_vertex_normals` makes them.
 
         Raises:
             MeshError: there are more or fewer nodes than in the mesh.
@@ -293,7 +295,7 @@ class EmbeddedSurface:
         return vertices, compute_vertex_normals(vertices, self.triangles)
 
     def deform_vertices(self, nodes: NDArray[np.floating]) -> NDArray[np.float32]:
-        """(V, 3) m, the vertices alone.
+        """Return (V, 3) m, the deformed vertices alone.
 
         Raises:
             MeshError: as `deform`.
@@ -341,7 +343,7 @@ def _check_surface(vertices: NDArray, triangles: NDArray) -> tuple[NDArray, NDAr
 
 
 def _find_far(mesh: TetrahedralMesh, location: MeshLocation) -> NDArray[np.bool_]:
-    """(V,) whether a vertex is too far outside the mesh to go with it."""
+    """Return (V,), whether a vertex is too far outside the mesh to go with it."""
     corners = mesh.nodes[mesh.tetrahedra[location.tetrahedra]]
     sides = corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]]
     longest = np.linalg.norm(sides, axis=2).max(axis=1)
@@ -350,7 +352,7 @@ def _find_far(mesh: TetrahedralMesh, location: MeshLocation) -> NDArray[np.bool_
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _carry(rest, nodes, weights, moved, vertices):
-    """vertices (V, 3) = rest (V, 3) + the displacements moved (N, 4) of its nodes (V, 4)."""
+    """Set vertices (V, 3) to rest (V, 3) + the displacements moved (N, 4) of nodes (V, 4)."""
     for v in range(len(rest)):
         i = nodes[v, 0]
         j = nodes[v, 1]

@@ -34,7 +34,7 @@ _ON_THEIR_SURFACE = ("vertex", "line", "line3", "triangle", "triangle6", "polygo
 def read_mesh(
     path: Path | str, metres_per_unit: float = 1.0, pose: Pose | None = None
 ) -> tuple[TetrahedralMesh, tuple[str, ...]]:
-    """A mesh from a Gmsh, VTK or VTU file, or any other with tetrahedra that meshio reads.
+    """Read a mesh from a Gmsh, VTK or VTU file, or any other with tetrahedra that meshio reads.
 
     Args:
         path: the file.
@@ -94,7 +94,7 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.integer], tuple[s
             parts.append(block.data)
         elif block.type == "tetra10":
             parts.append(block.data[:, :4])
-            report.append(_straightened(len(block.data)))
+            report.append(f"straightened the edges of {len(block.data)} quadratic tetrahedra")
         elif block.type not in _ON_THEIR_SURFACE and len(block.data):
             raise MeshError(
                 f"the file has {len(block.data)} cells of type {block.type}: mesh the body with "
@@ -104,7 +104,3 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.integer], tuple[s
         raise MeshError(f"the file has no tetrahedra: {_IS_SURFACE}")
     points = np.asarray(content.points, dtype=np.float64)
     return points, np.concatenate(parts), tuple(report)
-
-
-def _straightened(count: int) -> str:
-    return f"straightened the edges of {count} quadratic tetrahedra"

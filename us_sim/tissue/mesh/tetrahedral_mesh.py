@@ -25,7 +25,6 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import format_count
 
-# Boxes of cells between planes, and boxes of tetrahedra whose faces follow the structures.
 _LEAST_NODES = 64
 _MOST_ALONG = 400
 
@@ -74,7 +73,7 @@ class MeshSettings(Settings):
     )
 
     def check(self) -> None:
-        """A file, or a box whose corners and planes go together."""
+        """Refuse what is neither a file nor a box whose corners and planes go together."""
         box = {"lower": self.lower, "upper": self.upper, "planes": self.planes or None}
         if self.file is not None:
             for key, value in box.items():
@@ -90,6 +89,14 @@ class MeshSettings(Settings):
             raise self.make_error(
                 "", "`unit`, `pose` and `margin` are for a mesh from a `file` only"
             )
+        self._check_nodes()
+        for name in self.planes:
+            if name not in ("x", "y", "z"):
+                raise self.make_error("planes", f"unknown axis `{name}`; axes are x, y and z")
+        for axis, name in enumerate("xyz"):
+            self._check_axis(axis, name, self.lower[axis], self.upper[axis])
+
+    def _check_nodes(self) -> None:
         if isinstance(self.nodes, int):
             if self.planes:
                 raise self.make_error(
@@ -104,28 +111,22 @@ class MeshSettings(Settings):
                 f"nodes[{self.nodes.index(max(self.nodes))}]",
                 f"{max(self.nodes)} is outside 2 to {_MOST_ALONG}",
             )
-        for name in self.planes:
-            if name not in ("x", "y", "z"):
-                raise self.make_error("planes", f"unknown axis `{name}`; axes are x, y and z")
-        for axis, name in enumerate("xyz"):
-            lower, upper = self.lower[axis], self.upper[axis]
-            if lower >= upper:
-                raise self.make_error(
-                    f"upper[{axis}]",
-                    f"{upper:g} m is not above tissue.mesh.lower[{axis}], {lower:g} m",
-                )
-            if name in self.planes and not isinstance(self.nodes, int):
-                self._check_planes(name, self.planes[name], lower, upper, self.nodes[axis])
 
-    def _check_planes(
-        self, axis: str, planes: tuple[float, ...], lower: float, upper: float, count: int
-    ) -> None:
+    def _check_axis(self, axis: int, name: str, lower: float, upper: float) -> None:
+        if lower >= upper:
+            raise self.make_error(
+                f"upper[{axis}]",
+                f"{upper:g} m is not above tissue.mesh.lower[{axis}], {lower:g} m",
+            )
+        if name not in self.planes or isinstance(self.nodes, int):
+            return
+        planes, count = self.planes[name], self.nodes[axis]
         if len(planes) < 2 or any(b <= a for a, b in itertools.pairwise(planes)):
-            raise self.make_error(f"planes.{axis}", "needs two or more rising coordinates")
+            raise self.make_error(f"planes.{name}", "needs two or more rising coordinates")
         ends = zip((planes[0], planes[-1]), (lower, upper), strict=True)
         if len(planes) != count or not all(math.isclose(a, b, abs_tol=1e-9) for a, b in ends):
             raise self.make_error(
-                f"planes.{axis}",
+                f"planes.{name}",
                 f"must be {count} coordinates from {lower:g} to {upper:g} m, as nodes, lower and "
                 f"upper say",
             )
@@ -156,8 +157,8 @@ def check_mesh(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> N
     if not used.all():
         idle = np.flatnonzero(~used)
         raise MeshError(
-            f"{format_count(len(idle), 'mesh node belongs', 'mesh nodes belong')} to no tetrahedron, "
-            f"such as node {idle[0]}: remove them, or call `repair_mesh`"
+            f"{format_count(len(idle), 'mesh node belongs', 'mesh nodes belong')} to no "
+            f"tetrahedron, such as node {idle[0]}: remove them, or call `repair_mesh`"
         )
     _check_places(nodes)
     _check_volumes(nodes, tetrahedra)
@@ -165,7 +166,7 @@ def check_mesh(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> N
 
 
 def check_arrays(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> None:
-    """Refuse arrays that say nothing about a mesh, whatever is wrong with the mesh itself.
+    """Refuse arrays that cannot be a mesh's, whatever is wrong with the mesh itself.
 
     Raises:
         MeshError: wrong shapes or types, too many nodes, coordinates that are not finite or too
@@ -190,8 +191,9 @@ def check_arrays(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) ->
     bad = np.flatnonzero((np.abs(nodes) > _FARTHEST).any(axis=1))
     if len(bad):
         raise MeshError(
-            f"{format_count(len(bad), 'mesh node is', 'mesh nodes are')} farther than {_FARTHEST:g} m "
-            f"away, such as node {bad[0]} at {nodes[bad[0]].tolist()}: give coordinates in metres"
+            f"{format_count(len(bad), 'mesh node is', 'mesh nodes are')} farther than "
+            f"{_FARTHEST:g} m away, such as node {bad[0]} at {nodes[bad[0]].tolist()}: give "
+            f"coordinates in metres"
         )
     if tetrahedra.min() < 0 or tetrahedra.max() >= len(nodes):
         raise MeshError(
@@ -203,7 +205,7 @@ def check_arrays(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) ->
 def signed_volumes(
     nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]
 ) -> NDArray[np.float64]:
-    """(M,) m3, negative for an inverted tetrahedron."""
+    """Return (M,) m3, negative for an inverted tetrahedron."""
     a, b, c, d = (nodes[tetrahedra[:, corner]] for corner in range(4))
     b, c, d = b - a, c - a, d - a
     x = c[:, 1] * d[:, 2] - c[:, 2] * d[:, 1]
@@ -218,8 +220,8 @@ def _check_places(nodes: NDArray[np.float64]) -> None:
     if len(same):
         node, other = sorted((int(order[same[0]]), int(order[same[0] + 1])))
         raise MeshError(
-            f"{format_count(len(same), 'mesh node lies', 'mesh nodes lie')} exactly where another one "
-            f"lies, such as node {other} on node {node}: join them, or call `repair_mesh`"
+            f"{format_count(len(same), 'mesh node lies', 'mesh nodes lie')} exactly where another "
+            f"one lies, such as node {other} on node {node}: join them, or call `repair_mesh`"
         )
 
 
@@ -250,7 +252,7 @@ def _check_volumes(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) 
 
 
 def _check_faces(tetrahedra: NDArray[np.integer]) -> None:
-    """Whether tetrahedra meet face to face, two at a face, from its two sides."""
+    """Refuse tetrahedra that do not meet face to face, two at a face, from its two sides."""
     whole = np.sort(tetrahedra, axis=1).astype(np.int64)
     order = np.lexsort((whole[:, 2] << 32 | whole[:, 3], whole[:, 0] << 32 | whole[:, 1]))
     same = np.flatnonzero((whole[order[1:]] == whole[order[:-1]]).all(axis=1))
@@ -266,30 +268,31 @@ def _check_faces(tetrahedra: NDArray[np.integer]) -> None:
         first = starts[crowded[0]]
         several = (order[first : first + counts[crowded[0]]] // 4).tolist()
         raise MeshError(
-            f"the mesh is not manifold: {format_count(len(crowded), 'face belongs', 'faces belong')} "
-            f"to more than two tetrahedra, such as one of tetrahedra "
-            f"{', '.join(map(str, several))}: take out those that overlap"
+            f"the mesh is not manifold: "
+            f"{format_count(len(crowded), 'face belongs', 'faces belong')} to more than two "
+            f"tetrahedra, such as one of tetrahedra {', '.join(map(str, several))}: take out those "
+            f"that overlap"
         )
     paired = starts[counts == 2]
     one, other = order[paired], order[paired + 1]
     folded = np.flatnonzero(_turn(tetrahedra, one) == _turn(tetrahedra, other))
     if len(folded):
         raise MeshError(
-            f"{format_count(len(folded), 'pair of tetrahedra lies', 'pairs of tetrahedra lie')} on the "
-            f"same side of the face they share, such as {one[folded[0]] // 4} and "
+            f"{format_count(len(folded), 'pair of tetrahedra lies', 'pairs of tetrahedra lie')} on "
+            f"the same side of the face they share, such as {one[folded[0]] // 4} and "
             f"{other[folded[0]] // 4}: they overlap, mend the mesh"
         )
     _check_hinges(tetrahedra, one // 4, other // 4)
 
 
 def _turn(tetrahedra: NDArray[np.integer], numbers: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Whether faces name their nodes in an even permutation of ascending order."""
+    """Return whether faces name their nodes in an even permutation of ascending order."""
     a, b, c = tetrahedra[numbers[:, None] // 4, FACES[numbers % 4]].T
     return (a < b) ^ (b < c) ^ (a < c)
 
 
 def _check_hinges(tetrahedra: NDArray, one: NDArray, other: NDArray) -> None:
-    """Whether tetrahedra hang together by faces; the pairs (P,) and (P,) have one in common."""
+    """Refuse parts that hang together by no face; pairs ``one``, ``other`` (P,) share one."""
     body = connected_parts(len(tetrahedra), one, other)
     bodies = int(body.max()) + 1
     if bodies == 1:
@@ -377,7 +380,7 @@ class TetrahedralMesh:
 
 
 def uniform_planes(lo: float, hi: float, n: int) -> NDArray[np.float64]:
-    """(n,) m, equally spaced mesh planes of one axis from ``lo`` to ``hi``.
+    """Return (n,) m, equally spaced mesh planes of one axis from ``lo`` to ``hi``.
 
     Raises:
         MeshError: fewer than two planes.
@@ -388,12 +391,14 @@ def uniform_planes(lo: float, hi: float, n: int) -> NDArray[np.float64]:
 
 
 def box_mesh(planes_x: ArrayLike, planes_y: ArrayLike, planes_z: ArrayLike) -> TetrahedralMesh:
-    """A rectilinear grid of cells, five tetrahedra each, mirrored in every other cell to conform.
+    """Make a grid of cells, five tetrahedra each, mirrored in every other cell to conform.
 
     Node (i, j, k) has the index (i * len(planes_y) + j) * len(planes_z) + k.
 
     Args:
-        planes_x, planes_y, planes_z: m, ascending coordinates of the node planes of each axis.
+        planes_x: m, ascending coordinates of the node planes of x.
+        planes_y: of y.
+        planes_z: of z.
 
     Raises:
         MeshError: an axis has fewer than two planes, or they do not ascend.
@@ -426,7 +431,7 @@ def box_mesh(planes_x: ArrayLike, planes_y: ArrayLike, planes_z: ArrayLike) -> T
 
 
 def repair_mesh(nodes: ArrayLike, tetrahedra: ArrayLike) -> tuple[TetrahedralMesh, tuple[str, ...]]:
-    """A mesh from nodes and tetrahedra that may be in disorder.
+    """Make a mesh from nodes and tetrahedra that may be in disorder.
 
     Nodes in exactly the same place become one, and tetrahedra that have no volume because of that,
     repeated tetrahedra and unused nodes are left out. Inverted tetrahedra are turned. A tetrahedron
@@ -497,12 +502,11 @@ def _format_repair(verb: str, count: int, thing: str, how: str = "") -> str:
 
 
 def connected_parts(count: int, one: ArrayLike, other: ArrayLike) -> NDArray[np.int64]:
-    """Number the part of each of ``count`` vertices, from 0 in the order of their first vertices.
+    """Return (count,) the part of each vertex, numbered from 0 by their first vertices.
 
-    Args:
-        one, other: (E,) the vertices that each edge joins.
+    The vertices ``one`` and ``other`` (E,) are those that each edge joins.
     """
-    from scipy.sparse import coo_array  # which a tenth of a second is saved where no mesh is
+    from scipy.sparse import coo_array  # imported late: it takes a tenth of a second
     from scipy.sparse.csgraph import connected_components
 
     joined = coo_array((np.ones(np.size(one)), (one, other)), shape=(count, count))

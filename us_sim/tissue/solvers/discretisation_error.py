@@ -58,7 +58,7 @@ def estimate_relative_error(
     forces: NDArray[np.float64],
     reach: float,
 ) -> float:
-    """Relative L2 error of a displacement that is not zero, estimated.
+    """Estimate the relative L2 error of a displacement that is not zero.
 
     Args:
         model: of the tissue and the probe.
@@ -84,7 +84,7 @@ def estimate_contact_error(
     forces: NDArray[np.float64],
     reach: float,
 ) -> NDArray[np.float64]:
-    """(N, 3) m, how linear tissue moves from the contact that it has to one of its nodes alone.
+    """Return (N, 3) m, how linear tissue moves if its nodes alone are put onto the probe.
 
     The arguments are those of `estimate_relative_error`.
     """
@@ -99,13 +99,14 @@ def estimate_contact_error(
 def estimate_force_error(
     mesh: TetrahedralMesh, materials: TissueMaterials, displacement: NDArray[np.float64]
 ) -> float:
-    """By how much, relative, the mesh is too stiff for a displacement (N, 3) m that is not zero.
+    """Estimate how much, relative, a mesh is too stiff for a displacement (N, 3) m, not zero.
 
     >>> from us_sim.tissue.model import TissueModel
-    >>> block = TissueModel.block((1.0, 1.0, 1.0), (5, 5, 5))
+    >>> block = TissueModel.make_block((1.0, 1.0, 1.0), (5, 5, 5))
     >>> x, _, z = block.mesh.nodes.T - [[0.0], [0.0], [0.5]]
     >>> bent = 1e-6 * np.stack([-x * z, 0 * x, 0 * x], axis=1)
-    >>> 0.02 < estimate_force_error(block.mesh, block.materials, bent) < 0.2  # four cells across: 1 / 15
+    >>> error = estimate_force_error(block.mesh, block.materials, bent)
+    >>> 0.02 < error < 0.2  # four cells across: 1 / 15
     True
     """
     slope = np.einsum("eai,eaj->eij", displacement[mesh.tetrahedra], shape_gradients(mesh))
@@ -126,8 +127,10 @@ def estimate_force_error(
 def estimate_interpolation_error(
     mesh: TetrahedralMesh, displacement: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """L2 norms over the volume, in m times the root of m3, of the quadratic functions that a
-    displacement (N, 3) m misses, and of itself.
+    """Estimate the quadratic functions that a displacement (N, 3) m misses.
+
+    Returns:
+        L2 norms over the volume, in m times the root of m3, of these and of the displacement.
     """
     gradients, volumes = np.zeros((len(mesh.nodes), 3, 3)), np.zeros(len(mesh.nodes))
     _add_gradients(mesh.nodes, mesh.tetrahedra, displacement, gradients, volumes)
@@ -138,8 +141,9 @@ def estimate_interpolation_error(
 
 @njit(**_LOOP)
 def _add_gradients(nodes, tetrahedra, displacement, gradients, volumes):
-    """Add to gradients (N, 3, 3) and volumes (N,) a quarter of each tetrahedron's gradient times
-    its volume, and of its volume.
+    """Add to gradients (N, 3, 3) and volumes (N,) at the nodes of each tetrahedron.
+
+    Each of its nodes gets a quarter of its gradient times its volume, and of its volume.
     """
     e, area = np.empty((3, 3)), np.empty((3, 3))
     for t in range(len(tetrahedra)):
@@ -171,7 +175,7 @@ def _add_gradients(nodes, tetrahedra, displacement, gradients, volumes):
 
 @njit(**_LOOP)
 def _missing(nodes, tetrahedra, gradients):
-    """The integral of the square of the sum of 4 a b m over the edges of each tetrahedron.
+    """Integrate the square of the sum of 4 a b m over the edges of each tetrahedron.
 
     a and b are the linear functions of an edge's ends, and m is what a quadratic function is at its
     middle beyond their mean: an eighth of the change of the gradient along it, times its length. In

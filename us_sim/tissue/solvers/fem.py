@@ -8,7 +8,7 @@ adds up their fields.
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.solvers.fem import Fem
 >>> from us_sim.tissue.model import TissueModel
->>> solver = Fem(TissueModel.block())
+>>> solver = Fem(TissueModel.make_block())
 >>> deformation = solver.deform(Pose(position=[0.0, 0.0, 0.01]))
 >>> deformation.residual < 1e-6, bool(deformation.force[2] < 0)
 (True, True)
@@ -90,7 +90,7 @@ class Fem(TissueSolver):
 
     @property
     def state(self) -> TissueState:
-        """Where the tissue is; a quasi-static solver has no velocity."""
+        """Displacement of the tissue; a quasi-static solver has no velocity."""
         return TissueState(self._displacement.copy(), np.zeros_like(self._displacement))
 
     @property
@@ -98,7 +98,7 @@ class Fem(TissueSolver):
         return self._loaded
 
     def compute_contact_stiffness(self) -> NDArray[np.float64] | None:
-        """Exact, as the tissue is linear."""
+        """Compute the stiffness exactly, as the tissue is linear."""
         pushed = np.flatnonzero(self._contact.forces.any(axis=1))
         if self._pose is None or len(pushed) == 0:
             return np.zeros((6, 6))

@@ -8,7 +8,7 @@ D. Baraff and A. Witkin, Large Steps in Cloth Simulation, SIGGRAPH 1998, section
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.solvers.fem_cg import FemCg
 >>> from us_sim.tissue.model import TissueModel
->>> solver = FemCg(TissueModel.block())
+>>> solver = FemCg(TissueModel.make_block())
 >>> for _ in range(20):
 ...     deformation = solver.deform(Pose(position=[0.0, 0.0, 0.01]))
 >>> deformation.residual < 1e-6, bool(deformation.nodes[:, 2].min() > -0.01)
@@ -122,7 +122,7 @@ class FemCg(TissueSolver):
 
     @property
     def state(self) -> TissueState:
-        """Where the tissue is; a quasi-static solver has no velocity."""
+        """Displacement of the tissue; a quasi-static solver has no velocity."""
         state = TissueState.at_rest(len(self.model.mesh.nodes))
         state.displacement[self._free] = self._displacement
         return state

@@ -9,7 +9,7 @@ on but never shown.
 
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.model import TissueModel
->>> solver = FemNonlinear(TissueModel.block())
+>>> solver = FemNonlinear(TissueModel.make_block())
 >>> for _ in range(20):
 ...     deformation = solver.deform(Pose(position=[0.0, 0.0, 0.02]))
 >>> deformation.residual <= 1e-5, deformation.action
@@ -137,7 +137,7 @@ class FemNonlinear(TissueSolver):
 
     @property
     def state(self) -> TissueState:
-        """Where the tissue is; a quasi-static solver has no velocity."""
+        """Displacement of the tissue; a quasi-static solver has no velocity."""
         displacement = self._recovery.upright.T.copy()
         return TissueState(displacement, np.zeros_like(displacement))
 
@@ -146,7 +146,7 @@ class FemNonlinear(TissueSolver):
         return self._newton.rest.T
 
     def compute_contact_stiffness(self) -> NDArray[np.float64] | None:
-        """Approximate: tissue as at rest, forces that do not turn."""
+        """Approximate the stiffness by tissue as at rest, and forces that do not turn."""
         newton, contact = self._newton, self._newton.contact
         law = contact.slope, contact.gap, contact.normal
         gap, normal, softness = newton.points.merge_springs(*law)
@@ -169,9 +169,7 @@ class FemNonlinear(TissueSolver):
         )
 
     def estimate_discretisation_error(self) -> float | None:
-        """See `us_sim.tissue.solvers.discretisation_error`. Unknown of frames that are not in
-        balance.
-        """
+        """Estimate by `us_sim.tissue.solvers.discretisation_error`; None for unbalanced frames."""
         last, rest = self._last, self.model.mesh.nodes
         known = last.is_balanced and not last.interventions and len(self._surface)
         if not known or np.array_equal(last.nodes, rest):
@@ -287,18 +285,18 @@ class FemNonlinear(TissueSolver):
         return self._newton.applied_norm or self._greatest_norm
 
     def _exceeds(self, tolerance: float) -> bool:
-        """Whether the residual is greater, or in contact the displacement's estimated error."""
+        """Return whether the residual, or in contact the estimated error, is above a tolerance."""
         newton = self._newton
         if newton.residual_norm > tolerance * self._reference:
             return True
         return newton.contact_norm > 0.0 and newton.displacement_error > tolerance
 
     def _is_unloaded(self, pose: Pose | None) -> bool:
-        """Whether nothing reaches the tissue at rest."""
+        """Return whether nothing reaches the tissue at rest."""
         return pose is None or self._newton.measure_depth_at_rest(pose) <= GAP_TOLERANCE
 
     def _next_step(self, pose: Pose) -> Pose:
-        """The next load step on the way to a pose, or the last one until that is in balance."""
+        """Return the next load step on the way to a pose; the last one until that is in balance."""
         newton, last = self._newton, self._target
         if last is not None and newton.residual_norm > TUNING.load_step_tolerance * self._reference:
             return last
@@ -326,7 +324,7 @@ class FemNonlinear(TissueSolver):
                     break
 
     def _predict(self, pose: Pose) -> NDArray[np.float64]:
-        """(3, N) m, set a new pose and return the linear answer to it."""
+        """Set a new pose and return the linear answer to it, (3, N) m."""
         newton, contact, points = self._newton, self._newton.contact, self._newton.points
         held = newton.contact_forces[:, self._surface].T.copy()
         newton.set_pose(pose)
@@ -347,7 +345,7 @@ class FemNonlinear(TissueSolver):
         return field.astype(np.float64)
 
     def _obstacle(self) -> str:
-        """The node and the tetrahedron at which a tissue cannot be balanced, for a person."""
+        """Describe the node and the tetrahedron at which a tissue cannot be balanced."""
         newton = self._newton
         pulled = int(np.argmax(np.linalg.norm(newton.residual, axis=0)))
         nodes = self.model.mesh.nodes + newton.displacement.T
@@ -422,24 +420,24 @@ class InversionRecovery:
         self.restarts = False  # whether the next frame begins anew from rest
 
     def record_frame(self, displacement: NDArray[np.float64], is_upright: bool) -> None:
-        """Take note of the displacement (3, N) m at the end of a frame."""
+        """Record the displacement (3, N) m at the end of a frame."""
         if is_upright:
             self.upright, self.inverted_frames = displacement, 0
         else:
             self.inverted_frames += 1
 
     def must_restart(self, *, hurried: bool) -> bool:
-        """Whether tissue that is inside out has had its time to come out."""
+        """Return whether tissue that is inside out has had its time to come out."""
         return self.inverted_frames > (0 if hurried else TUNING.inverted_frames)
 
     def take_restart(self) -> bool:
-        """Whether this frame begins anew from rest; the next does not."""
+        """Return whether this frame begins anew from rest; the next does not."""
         restarts, self.restarts = self.restarts, False
         return restarts
 
 
 def plan_load_steps(last: Pose | None, pose: Pose, depth: float, arm: float) -> list[Pose]:
-    """Poses on the way of a probe, so that tissue is swept aside and not left where it was hit.
+    """Plan poses on a probe's way, so that tissue is swept aside and not left where it was hit.
 
     >>> steps = plan_load_steps(Pose(), Pose([0.0, 0.0, 0.008]), depth=0.008, arm=0.02)
     >>> [f"{pose.position[2]:.4f}" for pose in steps]

@@ -2,7 +2,7 @@
 
 >>> from us_sim.tissue.solvers.frame_budget import FramePace
 >>> pace = FramePace(sending=0.0005, cores=2)
->>> pace.spend(0.02)
+>>> pace.count_frame(0.02)
 >>> f"{1e3 * pace.limit:.1f} ms"
 '10.7 ms'
 """
@@ -31,7 +31,7 @@ class FrameBudget:
         self.reset()
 
     def reset(self) -> None:
-        """Count frames of a probe at rest anew."""
+        """Restart the count of frames of a probe at rest."""
         self._frames_at_rest = 0
 
     def begin_frame(
@@ -62,12 +62,12 @@ class FrameBudget:
 
     @property
     def is_hurried(self) -> bool:
-        """Whether the frame has a time limit that it must keep."""
+        """True in a frame with a time limit that it must keep."""
         return self.time_limit is not None and self._frames_at_rest < TUNING.rest_frames
 
     @property
     def allows_load_step(self) -> bool:
-        """Whether time and iterations are left for a load step and the rest of the frame."""
+        """True while time and iterations are left for a load step and the rest of the frame."""
         spent = self._allowed - self.iterations_left
         if spent > TUNING.load_step_iterations * self._allowed:
             return False
@@ -75,7 +75,7 @@ class FrameBudget:
 
     @property
     def is_late(self) -> bool:
-        """Whether the time that is left is for the pose itself, and no longer for load steps."""
+        """True once the time that is left is for the pose itself, and no longer for load steps."""
         return self._iterations_within(TUNING.load_step_time) < TUNING.least_iterations
 
     def spend_iterations(self, iterations: int) -> None:
@@ -87,7 +87,7 @@ class FrameBudget:
         self._now = self._clock()
 
     def end_step(self, iterations: int) -> None:
-        """As `spend`, with the time since `begin_step`."""
+        """Call `spend_iterations`, and measure the time since `begin_step`."""
         self.spend_iterations(iterations)
         now = self._clock()
         self.step_time, self._now = now - self._now, now
@@ -102,12 +102,12 @@ class FrameBudget:
         return max(in_time, TUNING.least_iterations)
 
     def is_over(self, *, balanced: bool) -> bool:
-        """Whether another step would end late; a live frame that is not balanced has longer."""
+        """Return whether another step would end late; a live frame out of balance has longer."""
         factor = 1.0 if balanced or self._is_strict else TUNING.overtime
         return self._iterations_within(factor) < TUNING.least_iterations
 
     def _iterations_within(self, factor: float) -> int:
-        """Iterations of a step that ends after this many times the frame's time."""
+        """Return the iterations of a step that ends after this many times the frame's time."""
         if self.time_limit is None:
             return sys.maxsize
         left = self._began + factor * self.time_limit - self._clock()
@@ -115,7 +115,7 @@ class FrameBudget:
 
     @property
     def is_shorter_than_a_step(self) -> bool:
-        """Whether the time limit that was set is shorter than the last Newton step took."""
+        """True if the time limit that was set is shorter than the last Newton step took."""
         return self._is_strict and self.step_time > (self.time_limit or math.inf)
 
 
@@ -126,7 +126,7 @@ LEAST = 0.002
 
 
 class FramePace:
-    """The time limit of each frame, so that poses at 60 Hz are kept up with.
+    """Time limit of each frame, so that poses at 60 Hz are kept up with.
 
     What a frame takes beyond a period is subtracted from the limits of those after it.
 
@@ -156,12 +156,12 @@ class FramePace:
 
 
 def _usable_cores() -> int:
-    """The cores that this process may run on."""
+    """Return how many cores this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def time_shortest_run(work: Callable[[], object]) -> float:
-    """s, on the wall, of the shortest of five runs of ``work``."""
+    """Return the time (s, on the wall) of the shortest of five runs of ``work``."""
     times = []
     for _ in range(5):
         began = time.perf_counter()

@@ -1,7 +1,7 @@
 """The paper's mass-spring-damper system: Algorithm 1, symplectic Euler, 20 steps a frame.
 
 >>> from us_sim.tissue.model import TissueModel
->>> solver = Msds(TissueModel.block())
+>>> solver = Msds(TissueModel.make_block())
 >>> print(solver.deform(Pose(position=[0.0, 0.0, 0.01])).action)
 masses scaled 159 to 198 times: unscaled, steps beyond 0.18 ms are unstable
 """
@@ -83,7 +83,7 @@ class MsdsSettings(SolverSettings):
 
 
 class Particles(NamedTuple):
-    """Masses, where they are and how fast they move; kernels write on all but the masses."""
+    """Masses, positions and velocities; kernels write on all but the masses."""
 
     inverse_mass: NDArray[np.float64]  # (N,), 1/kg, 0 where a particle is fixed
     positions: NDArray[np.float64]  # (N, 3), m
@@ -92,7 +92,7 @@ class Particles(NamedTuple):
 
 
 class ProbeMotion(NamedTuple):
-    """The probe's shape, and where it is in each step; in S = 0 steps when there is no probe."""
+    """Shape of the probe and its placement in each step; S = 0 steps when there is no probe."""
 
     box: NDArray[np.float64]  # the collider's `offset_box`
     forward: bool  # see `us_sim.tissue.contact.probe_gap.pushes_only_forward`
@@ -101,7 +101,7 @@ class ProbeMotion(NamedTuple):
 
 
 class ParticleContact(NamedTuple):
-    """The particles that the probe can touch, and the kernels' results for them."""
+    """Particles that the probe can touch, and the kernels' results for them."""
 
     reachable: NDArray[np.int32]  # (C,), the particles
     touched: NDArray[np.bool_]  # (C,), in the last sub-step
@@ -110,7 +110,7 @@ class ParticleContact(NamedTuple):
 
     @classmethod
     def make_untouched(cls, reachable: NDArray[np.int32]) -> ParticleContact:
-        """A contact in which nothing is touched."""
+        """Make a contact in which nothing is touched."""
         count = len(reachable)
         return cls(reachable, np.zeros(count, bool), np.zeros((count, 3)), np.zeros((2, 3)))
 
@@ -185,7 +185,7 @@ class Msds(TissueSolver):
 
     @property
     def state(self) -> TissueState:
-        """Where the tissue is and how fast it moves."""
+        """Displacement and velocity of the tissue."""
         return TissueState(self._positions - self.model.mesh.nodes, self._velocity.copy())
 
     @property
@@ -241,8 +241,8 @@ class Msds(TissueSolver):
         self._velocity[:] = 0.0
         self._residual_norm.reset()
         words = (
-            f"{format_count(inverted, 'tetrahedron', 'tetrahedra')} stayed inside out, so the tissue "
-            f"was put back to rest"
+            f"{format_count(inverted, 'tetrahedron', 'tetrahedra')} stayed inside out, so the "
+            f"tissue was put back to rest"
         )
         return 0, (words,), Intervention.PUT_TO_REST
 
@@ -268,7 +268,7 @@ class Msds(TissueSolver):
         return pose is not None and bool((self._measure_gaps(pose)[0] < 0).any())
 
     def _path(self, pose: Pose | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Rotations (S, 3, 3) and origins (S, 3) m of the probe at each step; S = 0 without one."""
+        """Return rotations (S, 3, 3) and origins (S, 3) m of the probe; S steps, 0 without one."""
         if pose is None:
             return np.empty((0, 3, 3)), np.empty((0, 3))
         before = self._pose or self._lift(pose)
@@ -283,7 +283,7 @@ class Msds(TissueSolver):
         return rotations, origins
 
     def _lift(self, pose: Pose) -> Pose:
-        """The start of a probe that was not there before: lifted straight up until it is clear."""
+        """Return the start of a probe that was not there before: lifted along its axis, clear."""
         gap, _ = self._measure_gaps(pose)
         depth = max(0.0, -float(gap.min(initial=0.0)))
         return Pose(pose.position - depth * pose.rotation[:, 2], pose.orientation)
@@ -328,13 +328,16 @@ class Msds(TissueSolver):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def advance_frame(springs, particles, probe, contact, time_step, substeps, steps):
-    """Moves the particles by ``steps`` of ``substeps`` of ``time_step`` (s) each, symplectic Euler.
+    """Move the particles by ``steps`` of ``substeps`` of ``time_step`` (s), by symplectic Euler.
 
     Args:
         springs: their `SpringArrays`.
         particles: `Particles`, moved here.
         probe: `ProbeMotion` of S = ``steps`` steps, or of none.
         contact: `ParticleContact`, filled in here as of the last sub-step; its wrench is added to.
+        time_step: s, of a sub-step.
+        substeps: of each step.
+        steps: of the frame.
     """
     inverse_mass, positions, velocity, force = particles
     duration = time_step * steps * substeps
@@ -356,7 +359,7 @@ def advance_frame(springs, particles, probe, contact, time_step, substeps, steps
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _stop_at_probe(particles, probe, step, contact, duration):
-    """Puts particles that have entered the probe onto it; they lose their velocity towards it.
+    """Put particles that have entered the probe onto it; they lose their velocity towards it.
 
     The impulses on the probe, over ``duration`` (s), are added to the wrench.
     """

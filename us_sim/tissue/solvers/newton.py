@@ -10,7 +10,7 @@ has to wait.
 
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.model import TissueModel
->>> newton = Newton(TissueModel.block(nodes=(5, 5, 5)))
+>>> newton = Newton(TissueModel.make_block(nodes=(5, 5, 5)))
 >>> newton.set_pose(Pose(position=[0.0, 0.0, 0.005]))
 >>> residual_norm, energy = newton.residual_norm, newton.energy
 >>> all(newton.step(20) for _ in range(6))
@@ -22,6 +22,7 @@ True
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,7 @@ from us_sim.tissue.linear_algebra.sparse_factors import FactoredStiffness
 from us_sim.tissue.linear_algebra.two_level import (
     CoarseGrid,
     Preconditioner,
+    Product,
     TwoLevel,
     add_blocks,
     clear_nodes,
@@ -138,11 +140,11 @@ class Newton:
         self._factors_left = TUNING.most_factors  # that may be made at this pose
 
     def measure_depth_at_rest(self, pose: Pose) -> float:
-        """How deep (m) a probe would be in the tissue at rest."""
+        """Return how deep (m) a probe would be in the tissue at rest."""
         return self.contact.measure_depth(pose, self._points_at_rest)
 
     def measure_depth(self, pose: Pose) -> float:
-        """How deep (m) a probe would be in the tissue as it is."""
+        """Return how deep (m) a probe would be in the tissue as it is."""
         return self.contact.measure_depth(pose, self.points.compute_positions(self.displacement))
 
     def set_pose(self, pose: Pose) -> None:
@@ -188,12 +190,12 @@ class Newton:
         self.contact.update_gaps(self._positions)
 
     def _assemble(self, energy: float | None = None) -> None:
-        """Find energy, unless `_evaluate` has just returned it, and residual."""
+        """Update energy, unless `_evaluate` has just returned it, and residual."""
         self.energy = self._evaluate() if energy is None else energy
         self._assemble_contact(self.energy)
 
     def _assemble_contact(self, energy: float | None = None) -> None:
-        """As `_assemble`, where only the contact has changed."""
+        """Update as `_assemble`, where only the contact has changed."""
         contact = self.contact
         self.energy = self._tissue_energy + contact.energy if energy is None else energy
         self.contact_forces = np.zeros_like(self._tissue_forces)
@@ -207,7 +209,7 @@ class Newton:
         self.contact_norm = _norm(free)
 
     def _evaluate(self) -> float:
-        """J, energy at the displacement; finds the tissue's forces there too, less its load."""
+        """Return the energy (J) at the displacement; update the tissue's forces, less its load."""
         self._tissue_energy = self.tissue.compute_energy_and_forces(
             self.displacement, self._tissue_forces
         )
@@ -217,8 +219,9 @@ class Newton:
         return self._tissue_energy + self.contact.energy
 
     def compile_kernels(self) -> None:
-        """Take a step with a factor, with damping and with points deep in the probe, as only some
-        frames do.
+        """Take a step with a factor, with damping and with points deep in the probe.
+
+        Only some frames do so.
         """
         self.set_pose(Pose(np.array([0.0, 0.0, 2 * self.contact.probe.deep])))
         self._needs_factor, self.may_factor, self._damping = True, True, TUNING.damping
@@ -228,7 +231,7 @@ class Newton:
     def step(
         self, iterations: int, goal: float = 0.0, start: NDArray[np.float64] | None = None
     ) -> bool:
-        """One Newton step with a line search.
+        """Take one Newton step with a line search.
 
         Args:
             iterations: limit of the conjugate gradients.
@@ -271,7 +274,7 @@ class Newton:
 
     @property
     def has_stagnated(self) -> bool:
-        """Whether even the shortest steps lead no further."""
+        """True if even the shortest steps lead no further."""
         return self._damping >= TUNING.most_damping
 
     @property
@@ -294,7 +297,7 @@ class Newton:
     def _minimise_model(
         self, iterations: int, goal: float, start: NDArray[np.float64] | None
     ) -> tuple[NDArray[np.float64], bool]:
-        """The step (3, N) m, and whether the tangent was found to be indefinite."""
+        """Find the step (3, N) m; return also whether the tangent was found to be indefinite."""
         self.iterations = 0
         contact, points, tangent = self.contact, self.points, self._tangent
         tangent.linearise(self.displacement.astype(self._dtype))
@@ -308,7 +311,7 @@ class Newton:
         geometric = points.nodes[turned], points.weights[turned], -turn
 
         def tangent_product(change: NDArray, image: NDArray) -> None:
-            """The tangent without springs, of which there are more or fewer as points touch."""
+            """Multiply by the tangent without springs, whose number changes as points touch."""
             tangent.tangent_product(change, image)
             if damping > 0.0:
                 add_blocks(self._rest_blocks, damping, change, image)
@@ -318,16 +321,7 @@ class Newton:
         step: NDArray[np.float64] = np.zeros_like(self.displacement)
         image: NDArray[np.float64] = np.zeros_like(step)  # of the step
         if start is not None:
-            step = start.copy()
-            scale = float(np.abs(step).max()) or 1.0
-            product = np.empty(step.shape, self._dtype)
-            tangent_product((step / scale).astype(self._dtype), product)
-            image = scale * product.astype(np.float64)
-            self.iterations += 1
-            none = np.zeros_like(contact.normal)
-            length = self._best_length(none, step, image, np.zeros_like(image))
-            step *= length
-            image *= length
+            step, image = self._take_guess(start, tangent_product)
         tolerance: float | None = None  # N
         interval = TUNING.contact_interval
         while True:
@@ -347,11 +341,6 @@ class Newton:
                 return step, False
             active, directions, stiffness = contact.springs_after(moved)
             springs = points.nodes[active], points.weights[active], directions, stiffness
-
-            def contact_product(change: NDArray, image: NDArray, springs: tuple = springs) -> None:
-                """The springs' forces, added."""
-                add_springs(*springs, change, image)
-
             lumped = points.lump_springs(active, directions, stiffness)
             self._conditioner = self._preconditioner(blocks, *lumped)
             solved = conjugate_gradients(
@@ -360,7 +349,7 @@ class Newton:
                 (residual / norm).astype(self._dtype),
                 min(iterations - self.iterations, interval),
                 tolerance / norm,
-                contact_product,
+                partial(add_springs, *springs),
             )
             self.iterations += solved.iterations
             interval *= 2
@@ -373,6 +362,22 @@ class Newton:
             if solved.curved:
                 return (step if step.any() else norm * solved.direction.astype(np.float64)), True
 
+    def _take_guess(
+        self, start: NDArray[np.float64], product: Product
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the best fraction of a guess of the step (3, N) m, and its product (3, N) N.
+
+        ``product`` writes the tangent times its first argument into the second.
+        """
+        scale = float(np.abs(start).max()) or 1.0
+        scaled = np.empty(start.shape, self._dtype)
+        product((start / scale).astype(self._dtype), scaled)
+        image = scale * scaled.astype(np.float64)
+        self.iterations += 1
+        none = np.zeros_like(self.contact.normal)
+        length = self._best_length(none, start, image, np.zeros_like(image))
+        return length * start, length * image
+
     def _best_length(
         self,
         moved: NDArray[np.float64],
@@ -380,8 +385,10 @@ class Newton:
         change_image: NDArray[np.float64],
         image: NDArray[np.float64],
     ) -> float:
-        """How much of a change (3, N) m lowers the model's energy most, the points having moved by
-        (P, 3) m; the tangent's products with the change and before it are (3, N) N.
+        """Return the fraction of a change (3, N) m that lowers the model's energy most.
+
+        The points have moved by ``moved`` (P, 3) m; the tangent's products with the change and with
+        what came before it are (3, N) N.
         """
         pull = -_dot(change, self._tissue_forces + image)
         curvature = _dot(change, change_image)
@@ -395,7 +402,7 @@ class Newton:
         directions: NDArray[np.float64],
         stiffness: NDArray[np.float64],
     ) -> Preconditioner:
-        """The preconditioner of the tangent, whose blocks are (6, N) N/m, with springs.
+        """Choose the preconditioner of the tangent, whose blocks are (6, N) N/m, with springs.
 
         A factor where one is needed, there is time for it, and it can be made. One serves all steps
         at a pose until a step with it needs more iterations than allowed. It is made anew for every
@@ -415,7 +422,7 @@ class Newton:
         return self._two_level
 
     def _search(self, change: NDArray[np.float64]) -> float:
-        """Backtracking line search along a change (3, N) m; returns the fraction taken."""
+        """Search along a change (3, N) m by backtracking; return the fraction taken."""
         start, energy, residual_norm = self.displacement, self.energy, self.residual_norm
         rounding = TUNING.energy_rounding * abs(energy)
         length = 1.0
@@ -432,8 +439,10 @@ class Newton:
 
 
 def _dot(first: NDArray[np.floating], second: NDArray[np.floating]) -> float:
-    """The product of (3, N) arrays. BLAS, by `np.vdot`, takes two threads beyond 10,000 numbers,
-    and while other programs run these wait for each other: frames took eight times as long.
+    """Return the product of (3, N) arrays.
+
+    BLAS, by `np.vdot`, takes two threads beyond 10,000 numbers, and while other programs run these
+    wait for each other: frames took eight times as long.
     """
     return float(np.einsum("ij,ij->", first, second))
 

@@ -3,7 +3,7 @@
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.model import TissueModel
 >>> from us_sim.tissue.solvers.solver import create_solver
->>> model = TissueModel.block()
+>>> model = TissueModel.make_block()
 >>> solver = create_solver("fem_cg", model)
 >>> deformation = solver.deform(Pose(position=[0.0, 0.0, 0.012]))
 >>> bool(deformation.force[2] < 0)  # the tissue pushes the probe back
@@ -12,7 +12,7 @@ True
 A tissue as small as can be, on which a solver calls the same kernels as on another.
 
 >>> from us_sim.tissue.solvers.solver import make_small_model
->>> len(make_small_model(TissueModel.block()).mesh.tetrahedra)
+>>> len(make_small_model(TissueModel.make_block()).mesh.tetrahedra)
 40
 """
 
@@ -39,7 +39,7 @@ from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueSt
 from us_sim.tissue.solvers.discretisation_error import estimate_force_error
 
 Progress = Callable[[float, str], None]
-"""Told the fraction done of what takes long, and what is being made."""
+"""Called with the fraction done of what takes long, and what is being made."""
 
 COUNT = Quantity("number", 1, 10_000)
 """Iterations, updates or steps in a frame."""
@@ -75,7 +75,7 @@ class TissueSolver(ABC):
     """For whom chooses the method: what it is, and what it is good for."""
     Settings: ClassVar[type[SolverSettings]] = SolverSettings
     """The class of this method's settings. A solver is made with the model, its settings, and a
-    callback that is told the fraction done and what is being made, or None."""
+    callback that takes the fraction done and what is being made, or None."""
     must_be_held: ClassVar[bool] = False
     """Whether every part of the mesh needs fixed nodes that hold it, as `require_held` says."""
     bears_load: ClassVar[bool] = False
@@ -107,7 +107,7 @@ class TissueSolver(ABC):
         self._last = self._resting()
 
     def deform(self, probe_pose: Pose | None) -> Deformation:
-        """One frame: move the probe and let the tissue follow.
+        """Advance a frame: move the probe and let the tissue follow.
 
         With a probe that has not moved and a tissue that has settled, nothing is computed.
 
@@ -130,11 +130,11 @@ class TissueSolver(ABC):
 
     @property
     def is_settled(self) -> bool:
-        """Whether another frame at the same pose would change nothing."""
+        """True if another frame at the same pose would change nothing."""
         return self._settled
 
     def _recover(self, good: TissueState) -> Deformation:
-        """The result in place of a frame that failed; the next one tries again."""
+        """Return the result in place of a frame that failed; the next one tries again."""
         self._failures += 1
         if self._failures < _FAILURES:
             action = "the frame came out not finite or far away, so the last good state was kept"
@@ -151,7 +151,7 @@ class TissueSolver(ABC):
         return replace(self._last, actions=(action,), interventions=done, is_balanced=False)
 
     def reset(self) -> None:
-        """Back to the undeformed tissue, with no probe near."""
+        """Return to the undeformed tissue, with no probe near."""
         self._restore(TissueState.at_rest(len(self.model.mesh.nodes)))
         self._pose = None
         self._settled = True
@@ -159,7 +159,7 @@ class TissueSolver(ABC):
         self._last = self._resting()
 
     def take_over(self, state: TissueState) -> None:
-        """Go on from where another solver of the same model is.
+        """Continue from the state of another solver of the same model.
 
         Raises:
             SolverError: the state has another number of nodes, is not finite, or moves a fixed one.
@@ -199,15 +199,15 @@ class TissueSolver(ABC):
         solver.deform(None)
 
     def _compile_rare_kernels(self) -> None:  # noqa: B027 - most solvers have none of these
-        """Call, for `warm_up`, the kernels that only some frames need."""
+        """Call the kernels that only some frames need, for `warm_up`."""
 
     @property
     @abstractmethod
     def state(self) -> TissueState:
-        """A copy of where the tissue is."""
+        """Copy of the tissue's displacement and velocity."""
 
     def compute_contact_stiffness(self) -> NDArray[np.float64] | None:
-        """How the wrench of the last frame changes with the probe's pose.
+        """Compute how the wrench of the last frame changes with the probe's pose.
 
         Returns:
             (6, 6) as `us_sim.tissue.contact.stiffness` says, zero without contact; None where this
@@ -216,7 +216,7 @@ class TissueSolver(ABC):
         return None
 
     def estimate_discretisation_error(self) -> float | None:
-        """Estimated relative L2 error of the last frame's displacement to the continuum's.
+        """Estimate the relative L2 error of the last frame's displacement to the continuum's.
 
         Returns:
             None where nothing is deformed, or this solver does not know it.
@@ -224,7 +224,7 @@ class TissueSolver(ABC):
         return None
 
     def estimate_force_error(self) -> float | None:
-        """Estimate by how much, relative, the mesh is too stiff, and so the last frame's force off.
+        """Estimate by how much, relative, the mesh is too stiff, and so the last force off.
 
         Returns:
             None where nothing is deformed, or the method does not balance an elastic solid.
@@ -236,7 +236,7 @@ class TissueSolver(ABC):
 
     @abstractmethod
     def _advance(self, pose: Pose | None) -> Deformation:
-        """One frame; sets ``_settled``. ``_pose`` is still the frame before's."""
+        """Compute one frame; set ``_settled``. ``_pose`` is still the frame before's."""
 
     @abstractmethod
     def _restore(self, state: TissueState) -> None:
@@ -267,13 +267,13 @@ def create_solver(
     progress: Progress | None = None,
     **values: Any,
 ) -> TissueSolver:
-    """A solver by the name that scenes and reports use.
+    """Make a solver by the name that scenes and reports use.
 
     Args:
         name: one of `SOLVERS`.
         model: the tissue.
         settings: of the solver's own class.
-        progress: told the fraction done of what takes long in making it, and what is being made.
+        progress: called with the fraction done of what takes long, and what is being made.
         values: settings by name, instead of ``settings``.
 
     Raises:
@@ -287,8 +287,10 @@ def create_solver(
 
 
 def make_small_model(model: TissueModel) -> TissueModel:
-    """A tissue of eight cells, like another in what decides which kernels are used: a box mesh or
-    another, the highest Poisson's ratio, how far moduli are apart, lumens, and the probe.
+    """Make a tissue of eight cells whose frames use the same kernels as another's.
+
+    It is like the other in what decides on kernels: a box mesh or another, the highest Poisson's
+    ratio, how far moduli are apart, lumens, and the probe.
     """
     side = np.linspace(-0.01, 0.01, 3)
     mesh = box_mesh(side, side, side + 0.01)
