@@ -147,7 +147,7 @@ _ON_A_DIAL = {"rate": "/min", "angular speed": "deg/s"}
 """Units of other dimensions, where a number is turned up and down."""
 
 _EXACT = 1e-12
-"""How far, relatively, a number in another unit may be from the number: only by rounding."""
+"""Relative distance of a number in another unit from the number: rounding only."""
 
 
 def format_quantity(value: float, dimension: str) -> str:

@@ -94,7 +94,7 @@ class Settings:
     error: ClassVar[type[UsSimError]] = SettingsError
     """The class of errors."""
     live: ClassVar[bool] = False
-    """Whether all of these settings may change while what they set is running."""
+    """True if all of these settings may change while what they set is running."""
     alternatives: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """Mutually exclusive settings and their dependants."""
 

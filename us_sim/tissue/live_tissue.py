@@ -48,7 +48,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ShapeDifference:
-    """How far the nodes of two deformations are apart."""
+    """Distances between the nodes of two deformations."""
 
     maximum: float  # m
     rms: float  # m

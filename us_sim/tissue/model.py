@@ -126,7 +126,7 @@ def nodes_in_label(
 
 
 class Intervention(Flag):
-    """A solver's remedies in a frame that went wrong; `Deformation.actions` say it to a person."""
+    """A solver's remedies in a frame that went wrong; `Deformation.actions` describe them."""
 
     NONE = 0
     FRAME_FAILED = auto()  # what came out was not finite or far away
@@ -143,7 +143,7 @@ class Deformation:
     nodes: NDArray[np.float64]  # (N, 3), m, frame patient, in mesh order
     contact_nodes: NDArray[np.int32]  # (K,), nodes that the probe pushes
     force: NDArray[np.float64]  # (3,), N, of the tissue on the probe, frame probe
-    torque: NDArray[np.float64]  # (3,), N m, likewise, about the origin of frame probe
+    torque: NDArray[np.float64]  # (3,), N m, on the probe about the origin of frame probe
     residual: float  # unbalanced force over contact force, of the solver's own equations
     actions: tuple[str, ...] = ()  # what the solver did to stay stable, in sentences
     inverted: int = 0  # tetrahedra inside out, as far as the solver counts them

@@ -40,7 +40,7 @@ _LEAN = math.radians(60)
 """Angle of the leaning flanks to the face."""
 
 _FLARE = 0.6
-"""How much wider than the collider the flanks become at each side, over the nodes' spacing."""
+"""Width over the collider's that the flanks gain at each side, over the nodes' spacing."""
 
 _RESOLVED = 2.0
 """Rounding, over the nodes' spacing, from which on they resolve it."""

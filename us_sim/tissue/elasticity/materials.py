@@ -84,7 +84,7 @@ def make_uniform_materials(mesh: TetrahedralMesh, material: Material) -> TissueM
 
 
 class LabelFractions(NamedTuple):
-    """How much of each tetrahedron each label fills."""
+    """Fractions of each tetrahedron that each label fills."""
 
     labels: NDArray[np.uint8]  # (L,) those that occur, ascending
     fractions: NDArray[np.float64]  # (M, L) of the volume; rows sum to 1

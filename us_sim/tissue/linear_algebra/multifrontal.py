@@ -97,7 +97,7 @@ _Update = tuple[NDArray[np.int64], NDArray[np.float64]]
 
 @dataclass(frozen=True, eq=False)
 class _Front:
-    """How the unknowns of one part follow those around it."""
+    """Responses of the unknowns of one part to those around it."""
 
     own: NDArray[np.int64]  # (O,), unknowns of the part
     around: NDArray[np.int64]  # (R,), unknowns of parts above that they touch
@@ -117,7 +117,7 @@ class EliminatedMesh:
     def compute_fields(self, nodes: NDArray[np.integer]) -> NDArray[np.floating]:
         """Return (N, 3, 3K) m/N, displacements by a unit force along each axis at nodes (K,).
 
-        The nodes are among those that `eliminate` was told; column 3 k + axis is of node k.
+        The nodes are among ``loaded`` of `eliminate`; column 3 k + axis is of node k.
         """
         loads = (3 * nodes[:, None] + np.arange(3)).ravel()
         fields: NDArray[np.floating] = np.zeros((self._unknowns, len(loads)), self._precision)
@@ -125,7 +125,7 @@ class EliminatedMesh:
         return self._solve(fields)
 
     def compute_displacement(self, load: NDArray[np.float64]) -> NDArray[np.floating]:
-        """Return (N, 3) m, the displacement by forces (N, 3) N on nodes that `eliminate` knows."""
+        """Return (N, 3) m, the displacement by forces (N, 3) N; see `eliminate` on the nodes."""
         right: NDArray[np.floating] = np.zeros((self._unknowns, 1), self._precision)
         right[: 3 * self._nodes, 0] = load.ravel()
         return self._solve(right)[:, :, 0]

@@ -47,7 +47,7 @@ class Fem(TissueSolver):
     """Linear elasticity under a probe, by the compliance of the surface that it can reach.
 
     The residual is the error of the stored fields by rounding, together with the forces along the
-    surface of a curved probe. Rounding is told exactly, by products of what it leaves unbalanced in
+    surface of a curved probe. Rounding is known exactly, by products of what it left unbalanced in
     the fields of unit forces; of a large mesh by a median, as measured when the fields were made.
 
     Args:

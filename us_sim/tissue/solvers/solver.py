@@ -66,7 +66,7 @@ class TissueSolver(ABC):
     """Deforms one tissue, frame by frame.
 
     A solver never returns a number that is not finite, nor nodes that flew off: when a frame fails
-    so, the last good state stays and the deformation's ``actions`` say it. After several such
+    so, the last good state stays and the deformation's ``actions`` report it. After several such
     frames in a row the tissue is put back to rest.
     """
 
@@ -77,9 +77,9 @@ class TissueSolver(ABC):
     """The class of this method's settings. A solver is made with the model, its settings, and a
     callback that takes the fraction done and what is being made, or None."""
     must_be_held: ClassVar[bool] = False
-    """Whether every part of the mesh needs fixed nodes that hold it, as `require_held` says."""
+    """True if every part of the mesh needs fixed nodes that hold it (`require_held`)."""
     bears_load: ClassVar[bool] = False
-    """Whether gravity and forces at nodes are among its equations."""
+    """True if gravity and forces at nodes are among its equations."""
     farthest: ClassVar[float] = 10.0
     """A node that moved by this many times the mesh's longest side has left the tissue."""
     most_unbalanced: ClassVar[float] = math.inf

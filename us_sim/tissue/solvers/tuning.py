@@ -98,7 +98,7 @@ class Tuning:
     """Cost of a Newton step besides its iterations, in iterations. Half: no change; twice: 1 %
     of the frames ended above 0.01, at up to 0.034."""
     overtime: float = 1.25
-    """How many times its time a live frame may take that is not in balance; those after it make up
+    """Time, over a live frame's own, that one out of balance may take; those after it make up
     for that. With 3, and nothing made up for, 3 % of the poses were lost."""
     overtime_tolerance: float = 0.01
     """Residual and error up to which a frame is in balance for that. Of 1,920 frames of brisk hands
@@ -112,9 +112,9 @@ class Tuning:
     """Frames of a probe at rest after which one that is not in balance may take longer than its
     time, to be solved."""
     rest_factor: int = 2
-    """How many times the iterations of other frames one of a probe at rest may take."""
+    """Iterations, over those of other frames, that a frame of a probe at rest may take."""
     restart_factor: int = 6
-    """How many times these one may take that begins anew from rest."""
+    """The same of a frame that begins anew from rest."""
 
     # Recovery, and when tissue is settled
     inverted_frames: int = 10
