@@ -1,4 +1,4 @@
-"""Agents that are written down.
+"""Agents that are written by hand.
 
 `VisualServo` looks for the largest dark and round spot, as a person looks for a vein, brings it to
 the image's middle, presses until it is gone, and lets go.
@@ -39,7 +39,7 @@ class Spot:
 
 
 def find_dark_pixels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(rows, columns) 1 where it is dark for tissue; all 0 in air."""
+    """Return (rows, columns), 1 at pixels that are dark for tissue; all 0 in air."""
     smooth = cv2.GaussianBlur(image, (0, 0), max(image.shape) / 128)
     lit = smooth[smooth > 4]
     if lit.size < 0.3 * image.size:
@@ -48,7 +48,7 @@ def find_dark_pixels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def find_dark_spots(image: NDArray[np.uint8]) -> list[Spot]:
-    """Dark spots the size of vessels that do not touch the image's border, the largest first."""
+    """Find dark spots the size of vessels, off the image's border, the largest first."""
     rows, columns = image.shape
     _, _, stats, centres = cv2.connectedComponentsWithStats(find_dark_pixels(image))
     found = []
@@ -61,12 +61,12 @@ def find_dark_spots(image: NDArray[np.uint8]) -> list[Spot]:
 
 
 class VisualServo:
-    """Finds the vein in the image, compresses it until it cannot be seen, and lets go.
+    """An agent that finds the vein in the image, presses until it is not seen, and lets go.
 
     Its actions are those of the `twist` control. It uses the entry `image` alone.
 
     Args:
-        press: press the vein once it is in the middle; without, it is only brought there.
+        press: press the vein once it is in the middle; else only bring it there.
     """
 
     def __init__(self, *, press: bool = True) -> None:
@@ -78,7 +78,7 @@ class VisualServo:
         self._gone = 0  # steps in a row without the vein
 
     def act(self, observation: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
-        """(6,) the next action."""
+        """Return the next action (6,)."""
         image = np.squeeze(observation["image"])
         spots = find_dark_spots(image)
         x, z = getattr(self, f"_{self.phase}")(image, spots)
@@ -97,7 +97,7 @@ class VisualServo:
         return self._enter_phase("centre") if touches or self._steps > 80 else (0.0, 0.25)
 
     def _centre(self, image: NDArray[np.uint8], spots: list[Spot]) -> tuple[float, float]:
-        """Bring the largest spot to the middle; slide to and fro where there is none."""
+        """Bring the largest spot to the middle; slide to and fro while there is none."""
         columns = image.shape[1]
         spot = self._find_followed_spot(spots) or (spots[0] if spots else None)
         if spot is None:
@@ -111,7 +111,7 @@ class VisualServo:
         return 6.0 * offset, 0.0 if self._press or self._steps > 24 else 0.15
 
     def _compress(self, image: NDArray[np.uint8], spots: list[Spot]) -> tuple[float, float]:
-        """Press until next to nothing is dark where the spot was, and somewhat further."""
+        """Press until almost nothing is dark at the spot's place, and somewhat further."""
         spot = self._find_followed_spot(spots)
         self._last = spot or self._last
         assert self._last is not None
@@ -128,11 +128,11 @@ class VisualServo:
         return self._enter_phase("release") if self._steps >= 10 else (0.0, 0.0)
 
     def _release(self, *_: Any) -> tuple[float, float]:
-        """Go up, to where the probe came from."""
+        """Lift the probe."""
         return 0.0, -0.4
 
     def _find_followed_spot(self, spots: list[Spot]) -> Spot | None:
-        """The spot that was followed so far: the nearest, where one is near."""
+        """Return the spot nearest to the one followed so far; None if it is not near."""
         if self._last is None or not spots:
             return None
         x, y = self._last.centre
@@ -142,11 +142,7 @@ class VisualServo:
 
 
 class WanderingAgent:
-    """Smooth random motion over the skin, pressed and let go about every three seconds.
-
-    Args:
-        seed: decides it.
-    """
+    """Smooth random motion over the skin, pressed and let go about every three seconds."""
 
     def __init__(self, seed: int) -> None:
         self._random = np.random.default_rng(seed)
@@ -154,7 +150,7 @@ class WanderingAgent:
         self._steps = 0
 
     def act(self, _: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
-        """(6,) the next action: noise that keeps 95 % of itself, and a wave along the axis."""
+        """Return the next action (6,): noise that keeps 95 % of itself, and a wave along z."""
         self._action = 0.95 * self._action + 0.1 * self._random.standard_normal(6)
         action = self._action.copy()
         action[2] = 0.35 * math.cos(2 * math.pi * self._steps / 90) + 0.2 * action[2]

@@ -1,9 +1,9 @@
-"""Data sets: episodes with images and every truth, the same bytes for any number of processes, on
-one machine or on many.
+"""Data sets: episodes with images and every truth.
 
-Each episode is one shard of a WebDataset (https://github.com/webdataset/webdataset): a tar file
-whose members of one step have one name. Beside it lies a JSON file of what was drawn. What is there
-whole is not made again, so an interrupted command is repeated and goes on.
+The bytes are the same for any number of processes, on one machine or on many. Each episode is one
+shard of a WebDataset (https://github.com/webdataset/webdataset): a tar file whose members of one
+step have one name. Beside it lies a JSON file of its draws. Whole episodes are not made again, so
+an interrupted command goes on when repeated.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ from us_sim.volume.partial_file import partial_file
 _COMPUTING = ("python", "us_sim_code", "numpy", "scipy", "numba", "opencv-python-headless")
 _CARD = Path(__file__).with_name("data_card.md")
 _WITHOUT_TASK = "HoldContact"
-"""The task whose environment moves the probe where none is asked for; it judges nothing then."""
+"""Task whose environment moves the probe if none is asked for; no reward is recorded then."""
 _FORMATS = {"webdataset": None, "lerobot": False, "lerobot-video": True}
-"""Whether images are a video, where the format is LeRobot's."""
+"""For LeRobot's formats: true if images are coded as a video."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class _EpisodeOrder:
     task: str | None
     seed: int
     name: str  # of the shard, without its ending
-    out: Path  # or what stands for one where files are not on this machine
+    out: Path  # or a UPath, for files that are not on this machine
 
     @property
     def shard_path(self) -> Path:
@@ -100,7 +100,7 @@ class _EpisodeOrder:
         return self.out / f"{self.name}.json"
 
     def read_facts(self) -> dict[str, Any] | None:
-        """The facts of an episode that is there whole."""
+        """Read the facts of the episode; None unless it is there whole."""
         with contextlib.suppress(OSError, ValueError):
             facts: dict[str, Any] = json.loads(self.facts_path.read_text(encoding="utf-8"))
             if self.shard_path.is_file():
@@ -111,7 +111,7 @@ class _EpisodeOrder:
 def make_dataset(
     scenes: Sequence[str], settings: DatasetSettings, changes: Mapping[str, Any] | None = None
 ) -> int:
-    """Make what is not there yet of a data set; return 1 if an episode failed, 0 else.
+    """Make the missing episodes of a data set; return 1 if an episode failed, else 0.
 
     Args:
         scenes: names or files.
@@ -125,8 +125,8 @@ def make_dataset(
     out = _open_folder(settings)
     loaded = [resolve_scene(scene, settings=changes) for scene in scenes]
     _require_format(loaded, out, settings)
-    head = _describe_dataset(scenes, loaded, settings)
-    _require_same(out, head)
+    description = _describe_dataset(scenes, loaded, settings)
+    _require_same(out, description)
     orders = list(_plan_episodes(scenes, loaded, settings, out))
     found = {order.name: order.read_facts() for order in orders}
     left = [order for order in orders if found[order.name] is None]
@@ -149,7 +149,7 @@ def make_dataset(
     if settings.task:
         successes["successes"] = sum(facts.get("is_success", False) for facts in made.values())
         amount += f", {successes['successes']} of them with the task done"
-    _write(out / "manifest.json", _encode_json({**head, **successes, "episodes": made}))
+    _write(out / "manifest.json", _encode_json({**description, **successes, "episodes": made}))
     card = _CARD.read_text(encoding="utf-8").format(
         amount=amount,
         scenes=", ".join(scenes),
@@ -172,7 +172,7 @@ def make_dataset(
 
 
 def _require_format(scenes: Sequence[Scene], out: Path, settings: DatasetSettings) -> None:
-    """Refuse before anything is made what the format cannot be written from or to.
+    """Refuse scenes and folders that the format does not allow, before anything is made.
 
     Raises:
         EpisodeError: the format is LeRobot's, and it is not installed, the folder is not on this
@@ -210,7 +210,7 @@ _Submit = Callable[[_EpisodeOrder], "Future[dict[str, Any]]"]
 def _make_episodes(
     orders: Sequence[_EpisodeOrder], settings: DatasetSettings
 ) -> Iterator[tuple[_EpisodeOrder, dict[str, Any]]]:
-    """Each episode with its facts, as they are finished."""
+    """Make the episodes; yield each with its facts, as it is finished."""
     workers = min(settings.workers, len(orders))
     if len(orders) <= 1 or (workers == 1 and settings.ray is None):
         yield from ((order, _make_episode(order)) for order in orders)
@@ -237,7 +237,7 @@ def _start_processes(workers: int) -> Iterator[_Submit]:
 
 
 def _begin_worker() -> None:
-    """End with the process that makes the data set, which alone hears Ctrl-C."""
+    """Ignore Ctrl-C, and end with the process that makes the data set."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
@@ -251,7 +251,7 @@ def _end_with_parent() -> None:
 
 @contextlib.contextmanager
 def _start_ray(address: str) -> Iterator[_Submit]:
-    """A Ray cluster, which makes an episode anew where its worker or node is lost.
+    """Connect to a Ray cluster, which makes an episode again if its worker or node is lost.
 
     Raises:
         EpisodeError: Ray is not installed, there is no such cluster, or it has lost an episode
@@ -291,7 +291,7 @@ _environments: dict[tuple[str, str | None], ScanEnvironment] = {}
 
 
 def _load_environment(order: _EpisodeOrder) -> ScanEnvironment:
-    """The environment of this process for an order's scene and task."""
+    """Return this process' environment for an order's scene and task."""
     key = order.scene_name, order.task
     if key not in _environments:
         cv2.setNumThreads(1)
@@ -302,7 +302,7 @@ def _load_environment(order: _EpisodeOrder) -> ScanEnvironment:
 
 
 def _make_episode(order: _EpisodeOrder) -> dict[str, Any]:
-    """Make an episode and its files; where it fails, the facts say why, and there is no shard.
+    """Make an episode and its files; if it fails, write no shard, and the error in its facts.
 
     Raises:
         EpisodeError: a file cannot be written.
@@ -316,14 +316,13 @@ def _make_episode(order: _EpisodeOrder) -> dict[str, Any]:
             f"{error}; make room and give the same command again, the episodes made so far are kept"
         ) from error
     except Exception as error:  # a solver's own, say: the other episodes go on
-        problem = str(error) if isinstance(error, UsSimError) else repr(error)
-        facts["error"] = problem
+        facts["error"] = str(error) if isinstance(error, UsSimError) else repr(error)
     _write(order.facts_path, _encode_json(facts))
     return facts
 
 
 class _FullError(UsSimError):
-    """A shard cannot be written."""
+    """Error of a shard that cannot be written, as on a full disk."""
 
 
 def _record_shard(order: _EpisodeOrder, path: Path) -> dict[str, Any]:
@@ -341,11 +340,8 @@ def _record_shard(order: _EpisodeOrder, path: Path) -> dict[str, Any]:
             observation, reward, done, truncated, info = environment.step(action)
             step = members.pop("json") | {"action": action.tolist()}
             if order.task:
-                known = {
-                    name: fact
-                    for name, fact in environment.task.collect_facts().items()
-                    if fact == fact
-                }
+                truths = environment.task.collect_facts()
+                known = {name: truth for name, truth in truths.items() if not np.isnan(truth)}
                 step |= {"reward": reward, "is_success": done, **known}
                 is_success = is_success or done
             members["json"] = _encode_json(step)
@@ -363,7 +359,7 @@ def _record_shard(order: _EpisodeOrder, path: Path) -> dict[str, Any]:
 def _collect_members(
     environment: ScanEnvironment, observation: Mapping[str, NDArray[Any]], labels: Mapping[int, str]
 ) -> dict[str, Any]:
-    """The files of a step by their endings; ``json`` is still a mapping."""
+    """Collect the files of a step by their endings; ``json`` is still a mapping."""
     state, area = environment.truth, environment.simulation.pixel_area
     members: dict[str, Any] = {"image.png": _encode_png(state.image)}
     step: dict[str, Any] = {
@@ -393,7 +389,7 @@ def _encode_png(image: NDArray[np.uint8]) -> bytes:
 
 
 def _encode_npy(array: NDArray[np.float32], unit: float) -> bytes:
-    """An int16 array in a unit, as a file; a quarter of the bytes of float64, and no subnormals."""
+    """Encode an array as int16 multiples of a unit: few bytes, and no subnormals."""
     stream = io.BytesIO()
     np.save(stream, np.rint(array / unit).clip(-32768, 32767).astype(np.int16))
     return stream.getvalue()
@@ -402,21 +398,21 @@ def _encode_npy(array: NDArray[np.float32], unit: float) -> bytes:
 def _describe_dataset(
     names: Sequence[str], scenes: Sequence[Scene], settings: DatasetSettings
 ) -> dict[str, Any]:
-    """All that decides the bytes, as JSON gives it back."""
+    """Return all that decides the bytes, as JSON reads it back."""
     lines = (line.rpartition(" ") for line in list_versions().splitlines())
     found = {name: version for name, _, version in lines if name in _COMPUTING}
-    head = {
+    described = {
         "seed": settings.seed,
         "task": settings.task,
         "episodes_of_each_scene": settings.episodes,
         "scenes": {name: dump_settings(scene) for name, scene in zip(names, scenes, strict=True)},
         "versions": {"us_sim": __version__, **found},
     }
-    same: dict[str, Any] = json.loads(_encode_json(head))
-    return same
+    read_back: dict[str, Any] = json.loads(_encode_json(described))
+    return read_back
 
 
-def _require_same(out: Path, head: Mapping[str, Any]) -> None:
+def _require_same(out: Path, description: Mapping[str, Any]) -> None:
     """Begin a data set in a folder, or make sure that it holds the same one.
 
     Raises:
@@ -428,17 +424,18 @@ def _require_same(out: Path, head: Mapping[str, Any]) -> None:
         if not manifest.exists():
             if out.exists() and any(out.iterdir()):  # a store of objects has no empty folders
                 raise EpisodeError(f"--out {out}: is not empty; choose another folder")
-            _write(manifest, _encode_json({**head, "episodes": {}}))
+            _write(manifest, _encode_json({**description, "episodes": {}}))
             return
-        there = json.loads(manifest.read_text(encoding="utf-8"))
+        found = json.loads(manifest.read_text(encoding="utf-8"))
     except ValueError:
-        there = {}
+        found = {}
     except UsSimError:
         raise
     except Exception as error:  # each kind of address has its own
         problem = getattr(error, "strerror", None) or error
         raise EpisodeError(f"--out {out}: cannot be used: {problem}") from error
-    other = [key for key in head if not isinstance(there, dict) or there.get(key) != head[key]]
+    found = found if isinstance(found, dict) else {}
+    other = [key for key, value in description.items() if found.get(key) != value]
     if other:
         raise EpisodeError(
             f"--out {out}: holds a data set of other {', '.join(other)}; choose another folder"
@@ -450,7 +447,7 @@ def _encode_json(content: Mapping[str, Any]) -> bytes:
 
 
 def _open_folder(settings: DatasetSettings) -> Path:
-    """The folder of a data set, or what stands for it at an address.
+    """Open the folder of a data set; a UPath if it is an address of fsspec.
 
     Raises:
         EpisodeError: the address cannot be used.
@@ -476,15 +473,15 @@ def _open_folder(settings: DatasetSettings) -> Path:
 
 @contextlib.contextmanager
 def _open_whole_file(path: Any, error_type: type[UsSimError] = EpisodeError) -> Iterator[Path]:
-    """A file of this machine to write, which is at ``path`` at the end, whole or not at all."""
-    is_here = isinstance(path, Path)
+    """Open a file of this machine, which comes to ``path`` at the end, whole or not at all."""
+    is_local = isinstance(path, Path)
     with contextlib.ExitStack() as stack:
-        here = path if is_here else Path(stack.enter_context(TemporaryDirectory()), path.name)
-        with partial_file(here, error_type=error_type) as partial:
+        local = path if is_local else Path(stack.enter_context(TemporaryDirectory()), path.name)
+        with partial_file(local, error_type=error_type) as partial:
             yield partial
-        if not is_here:
+        if not is_local:
             try:
-                path.fs.put_file(str(here), path.path)
+                path.fs.put_file(str(local), path.path)
             except Exception as error:  # each kind of address has its own
                 raise error_type(f"{path}: cannot be written: {error}") from error
 

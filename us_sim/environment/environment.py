@@ -1,4 +1,4 @@
-"""A gymnasium environment: a hand or a robot arm that scans a patient who gives way.
+"""A gymnasium environment: a hand or a robot arm that scans a patient of soft tissue.
 
 >>> import gymnasium, us_sim.environment
 >>> arm = gymnasium.make("us_sim/FindVein-v0", scene="tests/small_scene.yaml")
@@ -37,9 +37,9 @@ from us_sim.tracking.robot import clip_to_reach, compute_approach_speed
 DEFAULT_SCENE = "upper_arm_learning"
 
 _SENSOR = np.array([100.0, 100.0, 100.0, 10.0, 10.0, 10.0], np.float32)
-"""N, N m: range of the sensor that observes the wrench."""
+"""N, N m: range of the sensor of the wrench."""
 _FARTHEST = 0.1
-"""m, that tissue is observed to move."""
+"""m: range of the observed displacement of tissue."""
 _EPISODE = ("draw", "task", "_step", "_done", "_late")
 """Attributes of an environment that belong to the episode."""
 
@@ -51,11 +51,10 @@ def resolve_scene(
     case: str | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> Scene:
-    """Read the scene of that name or file, or of a case, with keys of its own changed.
+    """Read the scene of a name or file, or of a case, and change its keys.
 
     Args:
-        scene: name or file, or one that was read; `DEFAULT_SCENE` where neither scene nor case is
-            given.
+        scene: name or file, or a scene, which is returned; default: `DEFAULT_SCENE`.
         case: name or folder.
         settings: keys of a scene, as its YAML has them; NumPy's numbers are numbers.
 
@@ -75,7 +74,7 @@ def resolve_scene(
 
 
 class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
-    """One task in one scene; docs/learning.md says what its actions and observations mean.
+    """One task in one scene; docs/learning.md explains its actions and observations.
 
     Args:
         task: a name in `TASKS`.
@@ -84,8 +83,8 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     Raises:
         EpisodeError: there is no such task or render mode.
-        SceneError: the scene cannot be used, or not for this task, or an observation is asked for
-            that it cannot give.
+        SceneError: the scene cannot be used, or not for this task, or cannot give an observation
+            that it asks for.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - as gymnasium's own
@@ -142,7 +141,7 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
-        """What gymnasium knows of this environment, with the number of steps of an episode."""
+        """Entry in gymnasium's registry, with the number of steps of an episode."""
         return self._spec
 
     @spec.setter
@@ -205,7 +204,7 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._observe(), reward, is_done, truncated, self._make_info()
 
     def render(self) -> Any:
-        """(rows, columns, 3) the image as red, green and blue; None without a render mode.
+        """Return the image (rows, columns, 3), red, green and blue; None without a render mode.
 
         Raises:
             EpisodeError: no episode has begun.
@@ -216,7 +215,7 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     @property
     def truth(self) -> ScanState:
-        """Truth of the last step.
+        """State of the simulation after the last step.
 
         Raises:
             EpisodeError: no episode has begun.
@@ -226,7 +225,7 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._truth
 
     def state(self) -> dict[str, Any]:
-        """Copy all that decides what comes, so that `restore` can go on from here.
+        """Copy all that decides what follows, so that `restore` can go on from here.
 
         Raises:
             EpisodeError: no episode has begun.
@@ -236,7 +235,7 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         return kept | {name: copy.copy(getattr(self, name)) for name in _EPISODE}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a state of this environment, as often as is wanted."""
+        """Go on from a state of this environment, as often as needed."""
         self.simulation.restore(state["simulation"])
         self._truth, self.np_random = state["_truth"], copy.deepcopy(state["_np_random"])
         for name in _EPISODE:
@@ -245,14 +244,13 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
     def translate_twist(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the action that moves the probe as one of the `twist` control would.
 
-        With the `force` control it asks for the force that leads to the same velocity; no force
-        moves the probe away from where none is felt.
+        With the `force` control it asks for the force that leads to the same velocity. A probe
+        that feels no force cannot be moved away.
         """
-        given = self._settings
-        translated = action.copy()
-        if given.control == "force":
-            wanted = self.truth.force + action[2] * given.force_error
-            translated[2] = np.clip(2 * wanted / given.force - 1, -1, 1)
+        settings, translated = self._settings, action.copy()
+        if settings.control == "force":
+            wanted = self.truth.force + action[2] * settings.force_error
+            translated[2] = np.clip(2 * wanted / settings.force - 1, -1, 1)
         return translated
 
     def _make_info(self) -> dict[str, Any]:
@@ -267,18 +265,18 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         }
 
     def _compute_velocity(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (6,) m/s, rad/s in the probe's frame."""
-        given = self._settings
-        velocity = action * np.repeat([given.speed, given.angular_speed], 3)
-        if given.control == "force":
-            wanted = 0.5 * (action[2] + 1.0) * given.force
-            damping = given.force_error / given.speed
-            velocity[2] = compute_approach_speed(wanted, self.truth.force, damping, given.speed)
+        """Return the velocity (6,) m/s and rad/s that an action asks for, frame ``probe``."""
+        settings = self._settings
+        velocity = action * np.repeat([settings.speed, settings.angular_speed], 3)
+        if settings.control == "force":
+            wanted = 0.5 * (action[2] + 1.0) * settings.force
+            damping = settings.force_error / settings.speed
+            velocity[2] = compute_approach_speed(wanted, self.truth.force, damping, settings.speed)
         return velocity
 
     def _observe(self) -> Observation:
-        state, draw, made = self.truth, self.draw, {}
-        # Taken always, so that what is observed decides no byte of what comes.
+        state, draw, observation = self.truth, self.draw, {}
+        # Drawn always, so that the choice of observations changes no later random number.
         noise = self.np_random.standard_normal(6)
         noise *= np.repeat([draw.position_noise, draw.orientation_noise], 3)
         for name, space in self._spaces.items():
@@ -289,17 +287,13 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
             else:
                 value = getattr(state, name)
             limited = np.asarray(value, space.dtype).reshape(space.shape)
-            made[name] = limited.clip(space.low, space.high)
-        self._late.append(made)
+            observation[name] = limited.clip(space.low, space.high)
+        self._late.append(observation)
         return {name: value.copy() for name, value in self._late[0].items()}
 
 
 def _require_observable(scene: Scene) -> None:
-    """Refuse observations that a scene cannot give.
-
-    Raises:
-        SceneError: with the first of them.
-    """
+    """Raise SceneError for an observation that the scene cannot give."""
     for name in scene.episode.observe:
         if name in ("wrench", "displacement", "strain") and scene.tissue is None:
             raise SceneError(
@@ -324,7 +318,7 @@ def _pack_pose(pose: Pose) -> NDArray[np.float64]:
 
 
 def _convert_numpy(value: Any) -> Any:
-    """Return mappings, lists and numbers with NumPy's as Python's."""
+    """Return the value with NumPy's numbers and arrays as Python's numbers and lists."""
     if isinstance(value, Mapping):
         return {key: _convert_numpy(each) for key, each in value.items()}
     if isinstance(value, list | tuple):

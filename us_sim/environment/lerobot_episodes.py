@@ -1,7 +1,7 @@
 """Episodes of a data set as a LeRobot data set.
 
-Features ``observation.…`` are what was seen, late and noisy as the episode drew it, so that a
-policy learns from what it will get; features ``truth.…`` are of the moment, and exact.
+Features ``observation.…`` are late and noisy as the episode drew it, as a policy will get them;
+features ``truth.…`` are of the moment, and exact.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from us_sim.recording.lerobot_writer import (
 _PARTS = {"pose": POSE_PARTS, "goal": POSE_PARTS, "wrench": WRENCH_PARTS, "contact": ("contact",)}
 _ACTION = ("x", "y", "z", "rx", "ry", "rz")  # of the probe's velocity in its frame, -1 to 1
 _USED = ("image.png", "labels.png", "json")
-_Step = Mapping[str, Any]  # members by their endings
+_Step = Mapping[str, Any]  # files by their endings; of "json", the object
 
 
 def write_lerobot(
@@ -49,10 +49,10 @@ def write_lerobot(
     """Write a data set's episodes, in the order of their names, as a LeRobot data set.
 
     Args:
-        folder: to make; one that is there already is left as it is.
+        folder: of the LeRobot data set; a whole one that is there stays.
         shards: folder of the episodes' tar files.
-        episodes: their facts, by their names.
-        task: that they are of, if any.
+        episodes: facts of each episode, by its name.
+        task: of the episodes, a name in `TASKS`, if any.
         period: s, of a step.
         is_video: code images as video, which loses speckle.
 
@@ -76,10 +76,10 @@ def write_lerobot(
 
 
 def compute_frame_rate(period: float) -> int:
-    """The frames a second of steps of a period (s).
+    """Return the frames a second of steps of a period (s).
 
     Raises:
-        EpisodeError: it is no whole number.
+        EpisodeError: they are no whole number.
     """
     rate = round(1 / period)
     if abs(rate * period - 1) > 1e-6:
@@ -93,18 +93,13 @@ def compute_frame_rate(period: float) -> int:
 def read_episode(
     shard: Path, facts: Mapping[str, Any]
 ) -> tuple[Iterator[Frame], Mapping[str, Sequence[str]]]:
-    """The frames of an episode by LeRobot's names of features, and the names of their numbers.
-
-    Args:
-        shard: the episode's tar file.
-        facts: of the episode.
-    """
-    steps = list(_read_steps(shard))
+    """Read an episode's tar file: its frames, and the names of each feature's numbers."""
+    steps = _read_steps(shard)
     return _make_frames(steps, facts), _name_numbers(steps[0], facts)
 
 
-def _read_steps(shard: Path) -> Iterator[_Step]:
-    """The members of each step that are used."""
+def _read_steps(shard: Path) -> list[_Step]:
+    """Read the files of each step that a frame is made of."""
     members: dict[str, dict[str, Any]] = {}
     with shard.open("rb") as stream, tarfile.open(fileobj=stream, mode="r|") as tar:
         for member in tar:
@@ -112,21 +107,19 @@ def _read_steps(shard: Path) -> Iterator[_Step]:
             content = tar.extractfile(member)
             if content is not None and ending in _USED:
                 members.setdefault(name, {})[ending] = content.read()
-    for step in members.values():
-        step["json"] = json.loads(step["json"])
-        yield step
+    return [step | {"json": json.loads(step["json"])} for step in members.values()]
 
 
 def _name_numbers(step: _Step, facts: Mapping[str, Any]) -> dict[str, Sequence[str]]:
-    """Of the numbers of each feature, and of the labels."""
-    told = step["json"]
-    state = [f"{name}.{part}" for name in sorted(told["observed"]) for part in _PARTS[name]]
+    """Name the numbers of each feature, and the labels."""
+    record = step["json"]
+    state = [f"{name}.{part}" for name in sorted(record["observed"]) for part in _PARTS[name]]
     return {
         STATE: state,
         "action": _ACTION,
         "truth.pose": POSE_PARTS,
         "truth.wrench": WRENCH_PARTS,
-        "truth.areas": sorted(told.get("areas", ())),
+        "truth.areas": sorted(record.get("areas", ())),
         "truth.labels": [f"{number} {name}" for number, name in facts["labels"].items()],
     }
 
@@ -134,22 +127,22 @@ def _name_numbers(step: _Step, facts: Mapping[str, Any]) -> dict[str, Sequence[s
 def _make_frames(steps: Sequence[_Step], facts: Mapping[str, Any]) -> Iterator[Frame]:
     late: deque[NDArray[np.uint8]] = deque(maxlen=facts["draw"]["delay"] + 1)
     for step in steps:
-        told = step["json"]
+        record = step["json"]
         late.append(_decode_png(step["image.png"]))
         frame: dict[str, NDArray[Any]] = {f"{IMAGES}ultrasound": late[0]}
-        if observed := told["observed"]:
+        if observed := record["observed"]:
             frame[STATE] = _float32(np.concatenate([observed[name] for name in sorted(observed)]))
-        frame["action"] = _float32(told["action"])
-        if "reward" in told:
-            frame["next.reward"] = _float32([told["reward"]])
-            frame["next.success"] = np.array([told["is_success"]])
+        frame["action"] = _float32(record["action"])
+        if "reward" in record:
+            frame["next.reward"] = _float32([record["reward"]])
+            frame["next.success"] = np.array([record["is_success"]])
         frame["next.done"] = np.array([step is steps[-1]])
-        frame["truth.pose"] = _float32(told["pose"])
-        frame["truth.wrench"] = _float32(told["wrench"])
-        frame["truth.is_balanced"] = np.array([told["is_balanced"]])
-        frame["truth.contact"] = _float32([told["contact"]])
-        if "areas" in told:
-            frame["truth.areas"] = _float32([area for _, area in sorted(told["areas"].items())])
+        frame["truth.pose"] = _float32(record["pose"])
+        frame["truth.wrench"] = _float32(record["wrench"])
+        frame["truth.is_balanced"] = np.array([record["is_balanced"]])
+        frame["truth.contact"] = _float32([record["contact"]])
+        if "areas" in record:
+            frame["truth.areas"] = _float32([area for _, area in sorted(record["areas"].items())])
             frame["truth.labels"] = _decode_png(step["labels.png"])
         yield frame
 
@@ -164,14 +157,10 @@ def _decode_png(png: bytes) -> NDArray[np.uint8]:
 
 
 def _require_whole(folder: Path, count: int) -> None:
-    """Refuse a LeRobot data set of another number of episodes.
-
-    Raises:
-        EpisodeError: it is one, or none.
-    """
+    """Raise EpisodeError unless the folder is a LeRobot data set of ``count`` episodes."""
     try:
-        there = json.loads((folder / "meta" / "info.json").read_text(encoding="utf-8"))
-        has = there["total_episodes"]
+        text = (folder / "meta" / "info.json").read_text(encoding="utf-8")
+        has = json.loads(text)["total_episodes"]
     except (OSError, ValueError, TypeError, KeyError):
         has = "no"
     if has != count:

@@ -55,12 +55,12 @@ from us_sim.tissue.solvers.solver import TissueSolver
 from us_sim.volume.volume import Volume
 
 _VOLUMES = 4
-"""Phantoms of other speckle that are kept, with the labels in the tissue's mesh."""
+"""Number of volumes, of other speckle, that are kept with their tissue."""
 
 
 @dataclass(frozen=True, eq=False)
 class EpisodeDraw:
-    """An episode's values, drawn from `DrawRanges`; as they are here, the scene is as it says."""
+    """An episode's values, drawn from `DrawRanges`; the defaults leave the scene as it is."""
 
     stiffness: Mapping[str, float] = field(default_factory=dict)  # factor by label; else 1
     lumen_pressure: float = 1.0  # factor
@@ -76,7 +76,7 @@ class EpisodeDraw:
     def sample_values(
         cls, draws: DrawRanges, scene: Scene, random: np.random.Generator
     ) -> EpisodeDraw:
-        """The next values; a fixed number of them is taken, whatever the ranges are."""
+        """Draw the values; the ranges do not change how many random numbers are taken."""
 
         def sample_linear(name: str, count: int | None = None) -> Any:
             low, high = getattr(draws, name)
@@ -88,10 +88,8 @@ class EpisodeDraw:
 
         labels = sorted(scene.tissue.materials) if scene.tissue else []
         stiffness = dict(zip(labels, sample_factor("stiffness", len(labels)).tolist(), strict=True))
-        lumen_pressure, thickness = (
-            float(sample_factor("lumen_pressure")),
-            float(sample_linear("thickness")),
-        )
+        lumen_pressure = float(sample_factor("lumen_pressure"))
+        thickness = float(sample_linear("thickness"))
         place = [sample_linear("lateral"), sample_linear("elevational"), -sample_linear("height")]
         turn = np.array([*sample_linear("tilt", 2), sample_linear("rotation")])
         gain = float(sample_linear("gain"))
@@ -99,19 +97,18 @@ class EpisodeDraw:
         noise = float(sample_linear("position_noise")), float(sample_linear("orientation_noise"))
         delay = int(random.integers(*draws.delay, endpoint=True))
         start = Pose(np.array(place), rotation_exp(turn))
-        is_phantom = scene.volume.phantom is not None
-        seed = speckle if is_phantom else None
+        seed = speckle if scene.volume.phantom is not None else None
         return cls(stiffness, lumen_pressure, thickness, start, gain, seed, *noise, delay)
 
     def to_document(self) -> dict[str, Any]:
-        """The values as JSON, in SI units."""
+        """Return the values for JSON, in SI units."""
         start = [*self.start.position.tolist(), *self.start.orientation.tolist()]
         return {**vars(self), "stiffness": dict(self.stiffness), "start": start}
 
 
 @dataclass(eq=False)
 class ScanState:
-    """A pose of the probe, and what follows from it; images are made when they are asked for."""
+    """A pose of the probe, and its frame and forces; images are made when asked for."""
 
     pose: Pose  # of the probe, true
     frame: Frame
@@ -121,12 +118,12 @@ class ScanState:
 
     @property
     def force(self) -> float:
-        """N, by which the tissue pushes the probe back along its axis."""
+        """Force (N) by which the tissue pushes the probe back along its axis."""
         return -float(self.wrench[2])
 
     @cached_property
     def contact(self) -> float:
-        """Part of the face that touches, 0 to 1; without air in the scene, whether a force acts."""
+        """Part of the face that touches, 0 to 1; without air in the scene, 1 if a force acts."""
         contact = self.frame.contact
         return float(self.wrench.any()) if contact is None else float(contact[0].mean())
 
@@ -142,19 +139,19 @@ class ScanState:
 
     @cached_property
     def displacement(self) -> NDArray[np.float32]:
-        """(rows, columns, 2) m, lateral and axial way from rest; 0 where no tissue is."""
+        """(rows, columns, 2) m, lateral and axial displacement from rest; 0 outside tissue."""
         return np.nan_to_num(compute_displacement(self.frame))
 
     @cached_property
     def strain(self) -> NDArray[np.float32]:
-        """(rows, columns) axial strain against rest; 0 where no tissue is."""
+        """(rows, columns) axial strain against rest; 0 outside tissue."""
         assert self.strains is not None
         return np.nan_to_num(self.strains.compute_strain(self.frame))
 
 
 @dataclass(frozen=True, eq=False)
 class SimulationSnapshot:
-    """All that decides what a simulation gives for a pose."""
+    """All that decides the states of a simulation for the poses to come."""
 
     draw: EpisodeDraw
     solver: TissueSolver | None
@@ -167,7 +164,7 @@ class ScanSimulation:
     """The tissue, the skin and the scanner of a scene, as a draw changes them.
 
     Raises:
-        UsSimError: something of the scene cannot be made.
+        UsSimError: a part of the scene cannot be made.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -187,11 +184,11 @@ class ScanSimulation:
 
     @property
     def pixel_area(self) -> float:
-        """m² of a pixel."""
+        """Area of a pixel, m²."""
         return float(np.prod(self.scanner.probe.pixel_spacing))
 
     def find_label(self, name: str | None) -> int:
-        """The number of the label of that name; of the first vein where it is None.
+        """Return the number of the label of a name; of the first vein if it is None.
 
         Raises:
             SceneError: the volume has no such label.
@@ -208,10 +205,10 @@ class ScanSimulation:
         )
 
     def reset(self, draw: EpisodeDraw | None = None) -> None:
-        """Bring the tissue to rest with no probe near, and make what a draw changes.
+        """Bring the tissue to rest with no probe near, and rebuild what a draw changes.
 
         Raises:
-            UsSimError: something cannot be made.
+            UsSimError: the volume or the tissue cannot be made.
         """
         self._draw = draw = draw or EpisodeDraw()
         with self._blas.limit(limits=1, user_api="blas"):
@@ -257,19 +254,19 @@ class ScanSimulation:
         return ScanState(pose, frame, self._wrench, is_balanced, self._strains)
 
     def state(self) -> SimulationSnapshot:
-        """Copy where tissue and skin are, so that `restore` can go on from here."""
+        """Copy the states of tissue and skin, so that `restore` can go on from here."""
         moving = _copy_moving(self._solver), _copy_moving(self._membrane)
         return SimulationSnapshot(self._draw, *moving, self._wrench, self._number)
 
     def restore(self, state: SimulationSnapshot) -> None:
-        """Go on from a state of this simulation, as often as is wanted."""
+        """Go on from a state of this simulation, as often as needed."""
         if state.draw is not self._draw:
             self.reset(state.draw)
         self._solver, self._membrane = _copy_moving(state.solver), _copy_moving(state.membrane)
         self._wrench, self._number = state.wrench, state.number
 
     def compute_labels_at_rest(self, pose: Pose) -> NDArray[np.uint8]:
-        """(rows, columns) labels in the plane of a pose if the probe did not press."""
+        """Return labels (rows, columns) in the plane of a pose, of tissue at rest."""
         nodes = self._solver.model.mesh.nodes if self._solver is not None else None
         return self.scanner.render_labels(lift_probe(pose), nodes)
 
@@ -311,7 +308,7 @@ class ScanSimulation:
     def _load_drawn(
         self, speckle: int | None
     ) -> tuple[Volume, TissueModel | None, LabelFractions | None]:
-        """The scene's volume, its tissue, and the labels in that; they are kept for some seeds."""
+        """Load the volume of a seed, its tissue, and the labels in its mesh; keep the last."""
         if speckle not in self._volumes:
             given, scene = self.scene.volume, self.scene
             if speckle is not None:
@@ -332,7 +329,7 @@ T = TypeVar("T")
 
 
 def _copy_moving(moving: T) -> T:
-    """Copy what moves, but not the frozen dataclasses in it, such as the model."""
+    """Copy an object, but share the frozen dataclasses in it, such as the model."""
     constants = [
         value
         for value in getattr(moving, "__dict__", {}).values()
@@ -342,7 +339,7 @@ def _copy_moving(moving: T) -> T:
 
 
 def _scale_depths(mesh: TetrahedralMesh, factor: float) -> TetrahedralMesh:
-    """The mesh with all depths multiplied."""
+    """Return the mesh with all depths multiplied."""
     if mesh.planes is not None:
         x, y, z = mesh.planes
         return box_mesh(x, y, np.asarray(z) * factor)

@@ -18,7 +18,7 @@ from us_sim.geometry.se3 import rotation_exp
 from us_sim.slicing.settings import WALLS_TOUCH
 
 _OPEN = 0.5
-"""Part of it from which a vein counts as open."""
+"""Part of its area at rest from which a vein counts as open."""
 _HARDLY_CUT = 0.1
 """Part of its largest cross-section at rest in the episode below which a vessel is not in view."""
 _TOUCHING = 0.9
@@ -28,38 +28,35 @@ _TOUCHING = 0.9
 class EpisodeTask(ABC):
     """A task of one episode."""
 
-    in_short: ClassVar[str]
-    """The task, for a person."""
-    has_goal: ClassVar[bool] = False
-    """Whether observations have an entry `compute_goal`, a pose."""
+    has_goal: ClassVar[bool] = False  # observations have the pose of `compute_goal`
 
     def __init__(self, simulation: ScanSimulation) -> None:
         self._simulation = simulation
         self._held = 0  # steps in a row
 
     def begin_episode(self, state: ScanState) -> None:  # noqa: B027 - most tasks begin alike
-        """Begin with the probe where an episode starts."""
+        """Begin with the probe at the start of an episode."""
 
     @abstractmethod
     def judge_step(self, state: ScanState) -> tuple[float, float]:
         """Return a step's reward, -1 to 0, and the part of the task that is done, 0 to 1."""
 
     def compute_goal(self, step: int) -> Pose:  # noqa: ARG002
-        """Return the pose to be at, where the task has one."""
+        """Return the pose to reach, if the task has a goal."""
         return Pose()
 
     def collect_facts(self) -> dict[str, float]:
-        """Return truths of the last step, for a person or a data set."""
+        """Return the task's truths of the last step, by name; NaN if unknown."""
         return {}
 
     def _has_held(self, is_right: bool, steps: int) -> bool:
-        """Return whether this and the last steps were right."""
+        """Count right steps; return True once there are ``steps`` in a row."""
         self._held = self._held + 1 if is_right else 0
         return self._held >= steps
 
 
 class _VesselTask(EpisodeTask):
-    """A task about the target vessel, whose cross-section is compared with the plane's at rest."""
+    """A task of the target vessel; its area is compared with that in the same plane at rest."""
 
     def __init__(self, simulation: ScanSimulation) -> None:
         super().__init__(simulation)
@@ -69,7 +66,7 @@ class _VesselTask(EpisodeTask):
         self.offset = np.nan  # m, of the vessel from the image's middle; NaN unseen
 
     def begin_episode(self, state: ScanState) -> None:
-        """Look for the vessel."""
+        """Measure the vessel."""
         self._measure_vessel(state)
 
     def _measure_vessel(self, state: ScanState) -> None:
@@ -89,17 +86,15 @@ class _VesselTask(EpisodeTask):
         self.offset = float((columns.mean() - middle) * probe.pixel_spacing[0])
 
     def collect_facts(self) -> dict[str, float]:
-        """Return the area over that at rest, and the offset (m), NaN where it is not in view."""
+        """Return the area over that at rest, and the offset (m), NaN if it is not in view."""
         return {"target_area_fraction": self.fraction, "target_offset": self.offset}
 
 
 class FindVein(_VesselTask):
     """Bring the vein to the image's middle, in contact and not pressed flat."""
 
-    in_short = "the vein within 2 mm of the image's middle, open, the face in contact, for 10 steps"
-
     def judge_step(self, state: ScanState) -> tuple[float, float]:
-        """Reward nearness, and by another half contact that leaves the vein open."""
+        """Reward half by nearness to the middle, half by contact that leaves the vein open."""
         self._measure_vessel(state)
         half = self._simulation.scanner.probe.width / 2
         distance = float(np.fmin(abs(self.offset), half))
@@ -112,14 +107,12 @@ class FindVein(_VesselTask):
 class CompressVein(_VesselTask):
     """Compress the vein to closure, and let go."""
 
-    in_short = "the vein at 27 % of its area at rest for 5 steps, then open with less than 1 N"
-
     def __init__(self, simulation: ScanSimulation) -> None:
         super().__init__(simulation)
         self.is_closed = False  # at some time in the episode
 
     def judge_step(self, state: ScanState) -> tuple[float, float]:
-        """Return no reward but the part that is done, which grows the further an episode gets.
+        """Return no reward, and the part that is done, which grows as the episode proceeds.
 
         Up to 0.1 for contact and 0.2 for less of the vein, 0.5 once it was closed, up to 0.3 more
         for less force, and all of it when the vein is let go.
@@ -136,14 +129,12 @@ class CompressVein(_VesselTask):
         return 0.0, 0.5 + 0.3 * (1.0 - min(pressed, 1.0))
 
     def collect_facts(self) -> dict[str, float]:
-        """Add whether the vein was closed."""
+        """Add ``closed``, 1 once the vein was closed."""
         return super().collect_facts() | {"closed": float(self.is_closed)}
 
 
 class HoldContact(EpisodeTask):
     """Hold a force on the skin."""
-
-    in_short = "4 N along the probe's axis, within 20 %, the face in contact, for 60 steps"
 
     def judge_step(self, state: ScanState) -> tuple[float, float]:
         """Reward nearness to the force."""
@@ -155,10 +146,6 @@ class HoldContact(EpisodeTask):
 class FollowPlane(EpisodeTask):
     """Follow an image plane that slides along the arm and turns."""
 
-    in_short = (
-        "the image's corners within 2 mm of those of a plane that slides by 10 mm and turns by "
-        "10 deg in 200 steps, for 60 steps in a row"
-    )
     has_goal = True
 
     def __init__(self, simulation: ScanSimulation) -> None:
@@ -173,7 +160,7 @@ class FollowPlane(EpisodeTask):
         self._start = Pose(np.array([*state.pose.position[:2], 2e-3]))
 
     def compute_goal(self, step: int) -> Pose:
-        """Return the plane's pose at a step."""
+        """Return the pose of the plane at a step."""
         part = min(step / 200, 1.0)
         turn = np.array([0.0, 0.0, np.deg2rad(10.0) * part])
         return self._start @ Pose(np.array([0.0, 10e-3 * part, 0.0]), rotation_exp(turn))
@@ -187,7 +174,7 @@ class FollowPlane(EpisodeTask):
         return -min(self._error / 0.02, 1.0), float(self._has_held(self._error <= 2e-3, 60))
 
     def collect_facts(self) -> dict[str, float]:
-        """Return the largest distance (m) of a corner from where it should be."""
+        """Return the largest distance (m) of a corner of the image from its goal."""
         return {"plane_error": self._error}
 
 
