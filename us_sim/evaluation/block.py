@@ -27,7 +27,7 @@ LARGEST_MESH = (64, 32, 32)  # nodes along x, y and z
 
 @cache
 def make_block_mesh(counts: tuple[int, int, int]) -> TetrahedralMesh:
-    """The block at rest, with so many nodes along each axis."""
+    """Make the mesh of the block at rest, with ``counts`` nodes along x, y and z."""
     return box_mesh(
         *(uniform_planes(*side, count) for side, count in zip(EXTENT, counts, strict=True))
     )
@@ -36,9 +36,9 @@ def make_block_mesh(counts: tuple[int, int, int]) -> TetrahedralMesh:
 def make_graded_planes(
     low: float, high: float, fine_low: float, fine_high: float, size: float, growth: float
 ) -> NDArray[np.float64]:
-    """Planes (m) from ``low`` to ``high``: ``size`` apart where it is fine, growing outside.
+    """Place planes (m) from ``low`` to ``high``, ``size`` apart in the fine range.
 
-    Each distance outside is about ``growth`` (above 1) times the one before.
+    Outside it each distance is about ``growth`` (above 1) times the one before.
     """
     count = max(1, round((fine_high - fine_low) / size))
     parts = [np.linspace(fine_low, fine_high, count + 1)]

@@ -1,8 +1,8 @@
 """The three kinds of figure of the reports, each over a pandas DataFrame.
 
-`draw_error_over_time` and `draw_error_over_parameter` have a panel for each value of one column, a
-line for each value of another (its colour and mark are those of `LineLook`, or the next free ones), and
-the rows' points on it, in the order of x. `draw_image_grid` has a row and a column for each name.
+`draw_error_over_time` and `draw_error_over_parameter` draw a panel for each value of one column,
+and in it a line for each value of another, through the rows' points in the order of x.
+`draw_image_grid` has a row and a column for each name.
 
 >>> import pandas as pd
 >>> from us_sim.evaluation.figures import draw_error_over_time
@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -29,98 +29,70 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#999999")
-"""Okabe and Ito's, which are told apart in every common colour blindness."""
+"""Okabe and Ito's, distinct in every common colour blindness."""
 _MARKS = "oDs^vP*"
 _LIMIT: Mapping[str, Any] = {"color": "0.6", "lw": 1, "ls": ":", "zorder": 0}
 
 
 @dataclass(frozen=True)
 class LineLook:
-    """Colour and mark of a line; as Matplotlib names them."""
+    """Colour, mark and style of a line, as Matplotlib names them."""
 
     colour: str
     mark: str = "o"
     style: str = "-"
 
 
+@dataclass(frozen=True)
+class PlotOptions:
+    """Options of `draw_lines`; columns by their names in the table."""
+
+    panels: str = ""  # column with a panel for each of its values; empty: one panel
+    lines: str = ""  # column with a line for each of its values; empty: one line
+    log: str = ""  # the axes that are logarithmic, of "xy"
+    labels: Mapping[str, str] = field(default_factory=dict)  # words at the axes, by column
+    looks: Mapping[str, LineLook] = field(default_factory=dict)  # by line; else the next free one
+    filled: str = ""  # column of bools: True for full marks
+    join: bool = True  # join a line's points
+    limits: Mapping[str, float] = field(default_factory=dict)
+    """Dotted lines across x by their words in the key; with ``y:`` before, across y."""
+    floor: float = -math.inf  # smaller y are drawn there
+    share_y: bool = True  # one axis y for all panels
+
+
 def draw_error_over_time(
     table: pd.DataFrame, time: str, error: str, title: str, **options: Any
 ) -> Figure:
-    """Draw an error over a run time, both logarithmic; the arguments are `draw_lines`'."""
-    return draw_lines(table, time, error, title, **{"log": "xy", **options})
+    """Draw an error over a run time, both logarithmic, with `PlotOptions`."""
+    return draw_lines(table, time, error, title, PlotOptions(**{"log": "xy", **options}))
 
 
 def draw_error_over_parameter(
     table: pd.DataFrame, parameter: str, error: str, title: str, **options: Any
 ) -> Figure:
-    """Draw an error over a parameter, an axis each; the arguments are `draw_lines`'."""
-    return draw_lines(table, parameter, error, title, **{"log": "y", **options})
+    """Draw an error, logarithmic, over a parameter, with `PlotOptions`."""
+    return draw_lines(table, parameter, error, title, PlotOptions(**{"log": "y", **options}))
 
 
-def draw_lines(
-    table: pd.DataFrame,
-    x: str,
-    y: str,
-    title: str,
-    *,
-    panels: str = "",
-    lines: str = "",
-    log: str = "",
-    labels: Mapping[str, str] | None = None,
-    looks: Mapping[str, LineLook] | None = None,
-    filled: str = "",
-    join: bool = True,
-    limits: Mapping[str, float] | None = None,
-    floor: float = -math.inf,
-    share_y: bool = True,
-) -> Figure:
-    """Draw one column of a table over another.
-
-    Args:
-        table: a row a point; points that are not finite are left out.
-        x, y: columns.
-        title: of the figure.
-        panels: column with a panel for each of its values; one panel where it is not named.
-        lines: column with a line for each of its values.
-        log: the axes that are logarithmic, of "xy".
-        labels: words at the axes, by column.
-        looks: by value of ``lines``.
-        filled: column of bools: which marks are full.
-        join: whether a line joins a line's points.
-        limits: dotted lines across x by their words in the key; with ``y:`` before, across y.
-        floor: smaller y are drawn there.
-        share_y: whether all panels have one axis y.
-    """
-    labels, limits, looks = labels or {}, limits or {}, dict(looks or {})
+def draw_lines(table: pd.DataFrame, x: str, y: str, title: str, options: PlotOptions) -> Figure:
+    """Draw column ``y`` of a table over column ``x``; a row is a point, drawn if it is finite."""
     table = table[np.isfinite(table[x].astype(float)) & np.isfinite(table[y].astype(float))]
-    names = list(dict.fromkeys(table[lines])) if lines else [""]
-    free = itertools.cycle(
-        (colour, mark)
-        for colour, mark in zip(_COLOURS, _MARKS, strict=True)
-        if colour not in {look.colour for look in looks.values()}
-    )
-    for name in names:
-        looks.setdefault(name, LineLook(*next(free)))
-    groups = dict(list(table.groupby(panels, sort=False))) if panels else {"": table}
-    figure, axes = _make_panels(title, len(groups) or 1, 4.2, 3.6, share_y)
+    looks = _choose_looks(table, options)
+    groups: dict[Any, pd.DataFrame] = {"": table}
+    if options.panels:
+        groups = dict(list(table.groupby(options.panels, sort=False)))
+    figure, axes = _make_panels(title, len(groups) or 1, 4.2, 3.6, options.share_y)
     for panel, (name, points) in zip(axes, groups.items(), strict=False):
         panel.set_title(str(name), fontsize=11, loc="left")
-        for line in names:
-            some = (points[points[lines] == line] if lines else points).sort_values(x)
-            look = looks[line]
-            at = some[x].to_numpy(float), np.maximum(some[y].to_numpy(float), floor)
-            if join:
-                panel.plot(*at, look.style, color=look.colour, lw=1.2, alpha=0.8)
-            full = some[filled].to_numpy(bool) if filled else np.ones(len(some), dtype=bool)
-            for chosen, face in ((full, look.colour), (~full, "white")):
-                points_of = [values[chosen] for values in at]
-                panel.plot(*points_of, look.mark, mec=look.colour, mfc=face, ms=5.5)
-        for limit, value in limits.items():
+        for line, look in looks.items():
+            some = points[points[options.lines] == line] if options.lines else points
+            _draw_line(panel, some.sort_values(x), x, y, look, options)
+        for limit, value in options.limits.items():
             draw = panel.axhline if limit.startswith("y:") else panel.axvline
             draw(value, **_LIMIT)
-        panel.set(xlabel=labels.get(x, x), ylabel=labels.get(y, y))
+        panel.set(xlabel=options.labels.get(x, x), ylabel=options.labels.get(y, y))
         for letter, axis in (("x", panel.xaxis), ("y", panel.yaxis)):
-            if letter in log:
+            if letter in options.log:
                 panel.set(**{f"{letter}scale": "log"})
                 axis.set_major_locator(LogLocator(numticks=6))
                 axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -129,18 +101,44 @@ def draw_lines(
         panel.set_axisbelow(True)
         panel.spines[["top", "right"]].set_visible(False)
         panel.tick_params(labelsize=8.5)
-    shown = names if lines else []
-    keys = [
-        Line2D([], [], color=look.colour, marker=look.mark, ls=look.style if join else "", label=n)
-        for n, look in ((name, looks[name]) for name in shown)
-    ]
-    keys += [Line2D([], [], **_LIMIT, label=name.removeprefix("y:")) for name in limits]
-    if keys:
-        beside: Any = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0)}
-        axes[_count_columns(len(axes)) - 1].legend(
-            handles=keys, fontsize=8, frameon=False, **beside
-        )
+    _draw_key(axes, looks, options)
     return figure
+
+
+def _choose_looks(table: pd.DataFrame, options: PlotOptions) -> dict[str, LineLook]:
+    """Return the look of each line of the table, in order: the given one, or the next free one."""
+    taken = {look.colour for look in options.looks.values()}
+    looks = zip(_COLOURS, _MARKS, strict=True)
+    free = itertools.cycle(LineLook(*look) for look in looks if look[0] not in taken)
+    names = dict.fromkeys(table[options.lines]) if options.lines else [""]
+    return {name: options.looks.get(name) or next(free) for name in names}
+
+
+def _draw_line(
+    panel: Axes, points: pd.DataFrame, x: str, y: str, look: LineLook, options: PlotOptions
+) -> None:
+    places = points[x].to_numpy(float), np.maximum(points[y].to_numpy(float), options.floor)
+    if options.join:
+        panel.plot(*places, look.style, color=look.colour, lw=1.2, alpha=0.8)
+    full = np.ones(len(points), dtype=bool)
+    if options.filled:
+        full = points[options.filled].to_numpy(bool)
+    for chosen, face in ((full, look.colour), (~full, "white")):
+        marks = [values[chosen] for values in places]
+        panel.plot(*marks, look.mark, mec=look.colour, mfc=face, ms=5.5)
+
+
+def _draw_key(axes: Sequence[Axes], looks: Mapping[str, LineLook], options: PlotOptions) -> None:
+    """Draw the key of lines and limits beside the first row of panels."""
+    keys = []
+    for name, look in (looks if options.lines else {}).items():
+        style = look.style if options.join else ""
+        keys.append(Line2D([], [], color=look.colour, marker=look.mark, ls=style, label=name))
+    keys += [Line2D([], [], **_LIMIT, label=name.removeprefix("y:")) for name in options.limits]
+    if keys:
+        last = axes[_count_columns(len(axes)) - 1]
+        place: Any = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0)}
+        last.legend(handles=keys, fontsize=8, frameon=False, **place)
 
 
 def draw_image_grid(grid: Mapping[str, Mapping[str, NDArray[Any]]], title: str) -> Figure:
@@ -167,7 +165,7 @@ def draw_image_grid(grid: Mapping[str, Mapping[str, NDArray[Any]]], title: str) 
 def _make_panels(
     title: str, count: int, width: float, height: float, share_y: bool
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with so many panels of a size (inches)."""
+    """Make a figure with ``count`` panels of a size (inches)."""
     columns = _count_columns(count)
     rows = -(-count // columns)
     figure = _make_figure(title, width * columns + 2.0, height * rows + 0.7)
@@ -178,7 +176,7 @@ def _make_panels(
 
 
 def _count_columns(count: int) -> int:
-    """Panels in a row, of so many."""
+    """Return the number of panels in a row, of ``count`` panels."""
     return 2 if count == 4 else min(3, count)
 
 

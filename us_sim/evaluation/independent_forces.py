@@ -1,11 +1,11 @@
 """Forces that hold tissue at its displacements, by the equations of each method, in NumPy.
 
-They are written down a second time, in double precision, and share no code with a solver, so
-that rounding and omissions of a solver show: see `bound_imbalance`.
+They are written a second time, in double precision, and share no code with a solver, so that they
+show a solver's rounding and omissions: see `bound_imbalance`.
 
 >>> from us_sim.tissue.elasticity.material import Material
 >>> from us_sim.tissue.model import TissueModel
->>> block = TissueModel.block(nodes=(2, 2, 2), material=Material(10e3, 0.25))
+>>> block = TissueModel.make_block(nodes=(2, 2, 2), material=Material(10e3, 0.25))
 >>> pulled = block.mesh.nodes * [0.0, 0.0, 0.01]  # one percent of strain along z
 >>> forces = compute_hooke_forces(block.mesh, block.materials, pulled)
 >>> f"{forces[block.mesh.nodes[:, 2] > 0.05, 2].sum():.3f} N"  # 1.2 E of strain on 0.01 m2
@@ -26,23 +26,23 @@ from us_sim.tissue.model import Deformation, TissueModel
 
 Array: TypeAlias = NDArray[np.float64]
 Forces: TypeAlias = Callable[[Array], Array]
-"""(N, 3) N that hold the nodes at displacements (N, 3) m."""
+"""Forces (N, 3) N that hold the nodes at displacements (N, 3) m."""
 
 _ELEMENT_BULK = 5.0
 """Greatest (lambda + mu) / mu within tetrahedra; the rest acts on averages around nodes."""
 
 _ROUNDED = 10.0
-"""How many times the forces of rounding may be those of one random rounding of the nodes."""
+"""Bound of the forces of rounding, over those of one random rounding of the nodes."""
 
 
 def bound_imbalance(
     model: TissueModel, forces: Forces, deformation: Deformation
 ) -> tuple[float, float, float]:
-    """Return what is unbalanced at least, what may be rounding of it, and the load at most, N.
+    """Return bounds in N: the unbalanced force from below, its rounding and the load from above.
 
-    These are norms over all nodes. Nothing balances the nodes that the probe does not touch; what
-    it leaves at those that it touches is not known here, nor the size of its forces. If the
-    reported residual is true, unbalanced over contact forces, they are at most the load.
+    These are norms over all nodes. Nodes that the probe does not touch must balance by themselves;
+    the contact forces are not known here. If the reported residual (unbalanced over contact forces)
+    is true, the contact forces are at most the load.
     """
     displacement = deformation.nodes - model.mesh.nodes
     touched = np.zeros(len(displacement), dtype=bool)
@@ -65,7 +65,7 @@ def compute_hooke_forces(
     *,
     averaged: bool = False,
 ) -> Array:
-    """(N, 3) N that hold linear tetrahedra of Hooke's material at displacements (N, 3) m.
+    """Compute forces (N, 3) N that hold Hooke's material at displacements (N, 3) m.
 
     If ``averaged``, the greater part of a high bulk stiffness acts on averages around nodes
     (J. Bonet and A. J. Burton, A simple average nodal pressure tetrahedral element for
@@ -73,7 +73,7 @@ def compute_hooke_forces(
     Engng. 14, 1998).
     """
     shear, own, nodal = _split_moduli(materials, _ELEMENT_BULK if averaged else np.inf)
-    gradient = _gradients(mesh)
+    gradient = _compute_gradients(mesh)
     slope = _compute_slopes(mesh, gradient, displacement)
     pressure = (own - shear) * _trace(slope) + _average_around_nodes(mesh, nodal, _trace(slope))
     stress = shear[:, None, None] * (slope + slope.transpose(0, 2, 1))
@@ -83,19 +83,20 @@ def compute_hooke_forces(
 def compute_neo_hookean_forces(
     mesh: TetrahedralMesh, materials: TissueMaterials, displacement: Array
 ) -> Array:
-    """Derivative of the stable neo-Hookean energy with averaged pressures, (N, 3) N; no lumens.
+    """Compute forces (N, 3) N that hold a stable neo-Hookean material; pressures are averaged.
 
-    (B. Smith, F. de Goes and T. Kim, Stable Neo-Hookean Flesh Simulation, ACM Trans. Graph. 37,
-    2018, without its logarithmic barrier.)
+    They are the energy's derivative at displacements (N, 3) m, without lumens (B. Smith, F. de Goes
+    and T. Kim, Stable Neo-Hookean Flesh Simulation, ACM Trans. Graph. 37, 2018, without its
+    logarithmic barrier).
     """
     shear, own, nodal = _split_moduli(materials, _ELEMENT_BULK)
-    gradient = _gradients(mesh)
+    gradient = _compute_gradients(mesh)
     slope = _compute_slopes(mesh, gradient, displacement)
     # J - 1 as a polynomial in the displacement's gradient, so that nothing cancels.
     minors = (_trace(slope) ** 2 - _trace(slope @ slope)) / 2
     swelling = _trace(slope) + minors + np.linalg.det(slope)
     pressure = own * swelling + _average_around_nodes(mesh, nodal, swelling)
-    pressure += _wall_modulus(mesh, shear) * _crowding(1 + swelling)
+    pressure += _compute_wall_modulus(mesh, shear) * _differentiate_wall(1 + swelling)
     # mu F - mu cof F, again without cancelling: cof F - F = tr(H) I - H' - H + cof H.
     difference = (
         _trace(slope)[:, None, None] * np.eye(3)
@@ -110,7 +111,10 @@ def compute_neo_hookean_forces(
 def compute_spring_forces(
     edges: NDArray[np.int32], stiffness: Array, rest: Array, displacement: Array
 ) -> Array:
-    """(N, 3) N that hold springs of (E,) N/m along edges (E, 2), undeformed at ``rest`` (N, 3)."""
+    """Compute forces (N, 3) N that hold springs of (E,) N/m along edges (E, 2).
+
+    They are undeformed at ``rest`` (N, 3) m.
+    """
     before = rest[edges[:, 1]] - rest[edges[:, 0]]
     moved = displacement[edges[:, 1]] - displacement[edges[:, 0]]
     now = before + moved
@@ -125,15 +129,15 @@ def compute_spring_forces(
 
 
 def _split_moduli(materials: TissueMaterials, limit: float) -> tuple[Array, Array, Array]:
-    """Return mu, and of lambda + mu the elements' part, up to a multiple of mu, and the nodes'."""
+    """Return mu, the elements' part of lambda + mu, at most ``limit`` mu, and the nodes' part."""
     shear = materials.young_modulus / (2 + 2 * materials.poisson_ratio)
     whole = shear / (1 - 2 * materials.poisson_ratio)
     own = np.minimum(whole, limit * shear)
     return shear, own, whole - own
 
 
-def _gradients(mesh: TetrahedralMesh) -> Array:
-    """(M, 4, 3) 1/m: each shape function falls from its corner to the face opposite."""
+def _compute_gradients(mesh: TetrahedralMesh) -> Array:
+    """Compute gradients (M, 4, 3) 1/m of the shape functions of each corner."""
     corners = mesh.nodes[mesh.tetrahedra]
     gradient = np.empty_like(corners)
     for corner, (a, b, c) in enumerate(((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))):
@@ -144,9 +148,9 @@ def _gradients(mesh: TetrahedralMesh) -> Array:
 
 
 def _compute_slopes(mesh: TetrahedralMesh, gradient: Array, displacement: Array) -> Array:
-    """(M, 3, 3) gradient of the displacement, component by direction.
+    """Compute gradients (M, 3, 3) of the displacement, component by direction.
 
-    Relative to one corner, so that a displacement of a whole tetrahedron cancels exactly.
+    They are relative to one corner, so that translations cancel exactly.
     """
     moved = displacement[mesh.tetrahedra]
     return np.einsum("mai,maj->mij", moved - moved[:, :1], gradient)
@@ -160,12 +164,12 @@ def _gather_forces(mesh: TetrahedralMesh, gradient: Array, stress: Array) -> Arr
 
 
 def _average_around_nodes(mesh: TetrahedralMesh, modulus: Array, value: Array) -> Array:
-    """(M,) Pa, a modulus times the mean over the nodes of the weighted means around each node."""
+    """Return (M,) Pa: modulus times the mean over the corners of weighted means around each."""
     weight = modulus * mesh.volumes / 4
-    total, sum_of = np.zeros(len(mesh.nodes)), np.zeros(len(mesh.nodes))
-    np.add.at(total, mesh.tetrahedra, weight[:, None])
-    np.add.at(sum_of, mesh.tetrahedra, (weight * value)[:, None])
-    mean = np.divide(sum_of, total, out=np.zeros_like(total), where=total > 0)
+    weights, sums = np.zeros(len(mesh.nodes)), np.zeros(len(mesh.nodes))
+    np.add.at(weights, mesh.tetrahedra, weight[:, None])
+    np.add.at(sums, mesh.tetrahedra, (weight * value)[:, None])
+    mean = np.divide(sums, weights, out=np.zeros_like(sums), where=weights > 0)
     return np.asarray(modulus * mean[mesh.tetrahedra].mean(axis=1))
 
 
@@ -179,22 +183,22 @@ def _cofactors(matrices: Array) -> Array:
 
 
 _CROWDED, _CRUSHED = 1 / 4, 1 / 50
-"""Volume ratios below which a nonlinear tetrahedron resists being crushed, and more simply so."""
+"""Volume ratios below which a nonlinear tetrahedron resists crushing, and does so linearly."""
 
 _WALL = 5.0
 """Modulus of that resistance, over the geometric mean of a tetrahedron's own shear modulus and the
 largest among the tetrahedra with which it shares a node."""
 
 
-def _wall_modulus(mesh: TetrahedralMesh, shear: Array) -> Array:
-    """(M,) Pa, how firmly each tetrahedron resists being crushed."""
+def _compute_wall_modulus(mesh: TetrahedralMesh, shear: Array) -> Array:
+    """Compute the modulus (M,) Pa of each tetrahedron's resistance to crushing."""
     largest = np.zeros(len(mesh.nodes))
     np.maximum.at(largest, mesh.tetrahedra, shear[:, None])
     return np.asarray(_WALL * np.sqrt(shear * largest[mesh.tetrahedra].max(axis=1)))
 
 
-def _crowding(ratio: Array) -> Array:
-    """Derivative by J of (J0 - J)**3 / 3 J0 J below J0, straight on from where J is tiny."""
+def _differentiate_wall(ratio: Array) -> Array:
+    """Differentiate (J0 - J)**3 / 3 J0 J by J below J0; go on linearly where J is tiny."""
     held = np.clip(ratio, _CRUSHED, _CROWDED)
     missing = _CROWDED - held
     slope = -(missing**2) * (2 * held + _CROWDED) / (3 * _CROWDED * held**2)

@@ -1,4 +1,4 @@
-"""The simulator in a process of its own: what it sends, its processor time and its memory.
+"""The simulator in a process of its own: its messages, processor time and memory.
 
 >>> import os
 >>> from us_sim.evaluation.processes import measure_usage
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 def measure_usage(pid: int) -> dict[str, float] | None:
-    """Tell what a process has used until now; None where it has ended, or the system is silent.
+    """Measure the usage of a process so far; None if it has ended or there is no /proc.
 
     Returns:
         ``processor``, s of all its threads, and resident ``MB``; a page that n processes share
@@ -52,28 +52,28 @@ def measure_usage(pid: int) -> dict[str, float] | None:
 
 
 class UsageOverTime:
-    """Usage of the processes that another has started, those of one name added up."""
+    """Usage of all descendants of a process, added up by name."""
 
     def __init__(self, parent: int) -> None:
         self._parent, self._began = parent, time.monotonic()
         self._rows: list[dict[str, Any]] = []
 
     def update(self) -> None:
-        """Note what every process has used until now."""
+        """Record the usage of every descendant so far."""
         passed = time.monotonic() - self._began
         for pid, name in find_descendants(self._parent).items():
             if (usage := measure_usage(pid)) is not None:
                 self._rows.append({"process": name, "s": passed, **usage})
 
     def make_table(self) -> pd.DataFrame:
-        """A row a process and moment: ``process``, ``s``, ``processor`` (s) and ``MB``."""
+        """Make a row for each name and moment: ``process``, ``s``, ``processor`` (s), ``MB``."""
         rows = pd.DataFrame(self._rows, columns=["process", "s", "processor", "MB"])
         return rows.groupby(["process", "s"], sort=False, as_index=False).sum()
 
     def make_columns(self) -> dict[str, float]:
-        """Cores, memory in the end and its growth after a minute, of every process, for a row.
+        """Return cores, final memory and its growth after the first minute, of every name.
 
-        Growth is by least squares, and NaN in less than two minutes.
+        Growth is by least squares; NaN after less than two minutes.
         """
         found = {}
         for name, rows in self.make_table().groupby("process", sort=False):
@@ -88,7 +88,7 @@ class UsageOverTime:
 
 
 def find_descendants(pid: int) -> dict[int, str]:
-    """Names of all descendants of a process by their numbers: of a node, or of a program."""
+    """Find all descendants of a process: names of nodes or programs by process number."""
     found: dict[int, str] = {}
     waiting = [pid]
     while waiting:
@@ -117,11 +117,11 @@ class SimulatorProcess:
     began: float
 
     def read_output(self) -> str:
-        """Output so far."""
+        """Read the output so far."""
         return Path(self.output.name).read_text(encoding="utf-8", errors="replace")
 
     def require_running(self) -> None:
-        """Raise UsSimError when it has ended."""
+        """Raise UsSimError if the simulator has ended."""
         if self.process.poll() is not None:
             lines = self.read_output().strip().splitlines()
             raise UsSimError(f"us-sim has ended{': ' if lines else ''}{''.join(lines[-1:])}")
@@ -140,13 +140,13 @@ class SimulatorProcess:
 
 
 @contextlib.contextmanager
-def run_simulator(*words: str) -> Iterator[SimulatorProcess]:
-    """Run `us-sim` with these words until the context is left, which interrupts it."""
+def run_simulator(*arguments: str) -> Iterator[SimulatorProcess]:
+    """Run `us-sim` with arguments; interrupt it when the context is left."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(part for part in sys.path if part)}
     with tempfile.NamedTemporaryFile(prefix="us_sim_evaluate_") as output:
         began = time.monotonic()
         process = subprocess.Popen(
-            [sys.executable, "-m", "us_sim", *words],
+            [sys.executable, "-m", "us_sim", *arguments],
             env=environment,
             stdout=output,
             stderr=subprocess.STDOUT,
@@ -164,7 +164,7 @@ def run_simulator(*words: str) -> Iterator[SimulatorProcess]:
 
 @contextlib.contextmanager
 def record_arrivals() -> Iterator[Arrivals]:
-    """Note arrivals, in a thread of this process, until the context is left."""
+    """Record arrivals, in a thread of this process, until the context is left."""
     import rclpy
     from rclpy.context import Context
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -185,7 +185,7 @@ def record_arrivals() -> Iterator[Arrivals]:
 
     thread = threading.Thread(target=spin_node, daemon=True)
     thread.start()
-    raise_priority(2)  # the graph's wait for a core is measured, not the listener's for the nodes
+    raise_priority(2)  # so that this thread's wait for a core is not measured
     try:
         yield node
     finally:

@@ -1,4 +1,4 @@
-"""What the reports of all subjects say in the same way: tables, percentiles, laws, the machine.
+"""Parts of all subjects' reports: tables, percentiles, power laws, the machine.
 
 >>> from us_sim.evaluation.report import fit_exponent, format_markdown_table
 >>> print(format_markdown_table(("method", "ms"), [("fem", "0.1235"), ("msds", "12")]))
@@ -22,7 +22,7 @@ import numpy as np
 
 
 def format_markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table whose columns stand below each other; every row has as many cells as the head."""
+    """Format a table in Markdown, with aligned columns; rows have as many cells as the head."""
     widths = [max(len(cell) for cell in column) for column in zip(head, *rows, strict=True)]
     lines = [head, ["-" * max(width, 1) for width in widths], *rows]
     return "\n".join(
@@ -32,12 +32,12 @@ def format_markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) ->
 
 
 def compute_percentile(values: Sequence[float] | np.ndarray, percent: float) -> float:
-    """A percentile; NaN of no values."""
+    """Compute a percentile; NaN of no values."""
     return float(np.percentile(values, percent)) if len(values) else float("nan")
 
 
 def fit_exponent(cost_of_size: Mapping[float, float]) -> float:
-    """k in cost ~ size^k, by least squares of the logarithms; NaN with fewer than two sizes.
+    """Fit k in cost ~ size^k, by least squares of the logarithms; NaN of fewer than two sizes.
 
     Costs that are not positive and finite are left out.
     """
@@ -48,7 +48,7 @@ def fit_exponent(cost_of_size: Mapping[float, float]) -> float:
 
 
 def describe_machine(*libraries: str) -> str:
-    """Name processor, cores, system, and the versions of Python and of the libraries it has."""
+    """Name processor, cores, system, and versions of Python and of installed libraries."""
     processor = platform.processor() or platform.machine()
     try:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():

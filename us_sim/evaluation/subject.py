@@ -1,25 +1,23 @@
 """A subject of `us-sim evaluate`: pieces of work that yield rows, and a report of the table.
 
 A subject is a folder with a module that makes one `Subject`, and a page ``report.md``. Its
-``pieces`` are the work, by the name of the CSV file that their rows go to; each `Piece` says which
-case it measures, and has a function that returns rows (dicts) when it is called. The engine shows
-the progress, calls one piece after another, adds the case to each row, notes what a piece that
-fails raised (a row may also name a ``failure`` by itself), and writes the CSV: the columns stand as
-they first come up, and a key that the subject names as ``hidden`` is for the report alone, such as
-an array, an image or a whole object.
+``pieces`` are the work, by the name of the CSV file of their rows; each `Piece` names the case that
+it measures, and has a function that returns rows (dicts). The engine shows the progress, calls one
+piece after another, adds the case to each row, records the error of a piece that fails (a row may
+also have a ``failure``), and writes the CSV: columns stand in the order of their first row, and
+keys that the subject names as ``hidden``, such as an image, are for the report alone.
 
-The subject's ``report`` gets a pandas DataFrame for each CSV file, in order, failed pieces left
-out, and returns the `Report`: at most five lines for a reader to take home, `Target`s where the
-subject has some, and by name what stands at the places ``$name`` of the page. A place holds text, a
-list of lines (a bulleted list), a DataFrame (a table), or a figure of `us_sim.evaluation.figures`
-(written as ``SUBJECT_name.png``). A section of the page (from ``##`` to the next) of whose places
-none has anything is left out.
+The subject's ``report`` gets a pandas DataFrame for each CSV file, in order, without failed pieces,
+and returns the `Report`: at most five lines to take home, `Target`s if there are any, and the
+contents of the places ``$name`` of the page. A place holds text, a list of lines (a bulleted list),
+a DataFrame (a table), or a figure of `us_sim.evaluation.figures` (written as
+``SUBJECT_name.png``). A section of the page (from ``##`` to the next) whose places are all empty is
+left out.
 
-The page comes out as: title, what to take home, how and on what machine it was measured, targets,
-then ``report.md``, then what failed. The command is ``us-sim evaluate SUBJECT [--quick]``; the
-registry's target is the `Subject`, which is called with the folder, ``quick``, and the subject's
-settings if it has some; these go to ``pieces``, too. It prints the lines to take home and returns 1
-where something failed.
+The page has: title, lines to take home, command and machine, targets, ``report.md``, failures. The
+command is ``us-sim evaluate SUBJECT [--quick]``; it calls the `Subject` with the folder, ``quick``,
+and the subject's settings if it has some, which go to ``pieces``, too. It prints the lines to take
+home, and returns 1 if a piece failed.
 
 >>> from us_sim.evaluation.subject import Target, format_data_frame
 >>> Target.at_most("an image", 2.0, 1.5, "ms").cells
@@ -57,7 +55,7 @@ Place: TypeAlias = "str | Sequence[str] | pd.DataFrame | Figure"
 class Piece:
     """One piece of a subject's work."""
 
-    case: Mapping[str, Any]  # the columns that say what is measured, in every one of its rows
+    case: Mapping[str, Any]  # the columns that name what is measured, in each of its rows
     measure: Callable[[], Iterable[Mapping[str, Any]]]
 
     def __str__(self) -> str:
@@ -70,37 +68,38 @@ class Piece:
 class Target:
     """One line of a report's table of targets."""
 
-    what: str
+    quantity: str
     asked: str
-    seen: str = "not measured"
-    met: bool | None = None  # None where it was not measured
+    measured: str = "not measured"
+    met: bool | None = None  # None if it was not measured
 
     @classmethod
-    def at_most(cls, what: str, limit: float, seen: float, unit: str = "") -> Target:
-        """A limit from above; ``seen`` is NaN where it was not measured."""
-        return cls._make_limit(what, f"at most {limit:g}", seen, seen <= limit, unit)
+    def at_most(cls, quantity: str, limit: float, value: float, unit: str = "") -> Target:
+        """Set a limit from above; ``value`` is NaN if it was not measured."""
+        return cls._set_limit(quantity, f"at most {limit:g}", value, value <= limit, unit)
 
     @classmethod
-    def at_least(cls, what: str, limit: float, seen: float, unit: str = "") -> Target:
-        """A limit from below; likewise."""
-        return cls._make_limit(what, f"at least {limit:g}", seen, seen >= limit, unit)
+    def at_least(cls, quantity: str, limit: float, value: float, unit: str = "") -> Target:
+        """Set a limit from below; ``value`` is NaN if it was not measured."""
+        return cls._set_limit(quantity, f"at least {limit:g}", value, value >= limit, unit)
 
     @classmethod
-    def _make_limit(cls, what: str, asked: str, seen: float, met: bool, unit: str) -> Target:
+    def _set_limit(cls, quantity: str, asked: str, value: float, met: bool, unit: str) -> Target:
         unit = unit and f" {unit}"
-        if not np.isfinite(seen):
-            return cls(what, asked + unit)
-        return cls(what, asked + unit, f"{seen:.3g}{unit}", bool(met))
+        if not np.isfinite(value):
+            return cls(quantity, asked + unit)
+        return cls(quantity, asked + unit, f"{value:.3g}{unit}", bool(met))
 
     @property
     def cells(self) -> tuple[str, str, str, str]:
-        """Cells in the table."""
-        return self.what, self.asked, self.seen, {True: "yes", False: "no", None: ""}[self.met]
+        """Cells of the target in the table."""
+        met = {True: "yes", False: "no", None: ""}[self.met]
+        return self.quantity, self.asked, self.measured, met
 
 
 @dataclass(frozen=True)
 class Report:
-    """What a subject says of its table."""
+    """A subject's findings: lines to take home, contents of the page, targets."""
 
     take_home: Sequence[str]  # at most five lines
     places: Mapping[str, Place]
@@ -124,15 +123,14 @@ class Subject:
 
         Args:
             out: the folder, made if it is not there.
-            quick: whether it is the short run.
+            quick: run the short version.
             settings: of the subject, if it has some.
 
         Returns:
             1 if a piece failed, else 0.
 
         Raises:
-            UsSimError: the folder cannot be written, or holds a report. That is said before
-                anything is measured, so that nothing that took hours is lost.
+            UsSimError: the folder cannot be written, or holds a report; nothing is measured then.
         """
         page = out / f"{self.name}.md"
         _check_folder(out, page)
@@ -177,7 +175,7 @@ class Subject:
         cells.to_csv(file, index=False, lineterminator="\n")
 
     def _fill_page(self, out: Path, places: Mapping[str, Place]) -> str:
-        """Text of the subject's ``report.md`` with its places filled, and its figures written."""
+        """Write the figures, and return the text of ``report.md`` with its places filled."""
         filled = {}
         for name, place in places.items():
             if isinstance(place, Figure):
@@ -196,7 +194,7 @@ class Subject:
 
 
 def format_data_frame(table: pd.DataFrame, form: str = ".3g") -> str:
-    """Write a table in Markdown, its floats in a format; what is not known is empty."""
+    """Format a table in Markdown, its floats in ``form``; missing values are empty."""
     rows = [[_format_cell(value, form) for value in row] for row in table.astype(object).to_numpy()]
     return format_markdown_table([str(name) for name in table.columns], rows) if rows else ""
 
@@ -233,7 +231,7 @@ def _check_folder(out: Path, page: Path) -> None:
 def _measure(
     name: str, pieces: Sequence[Piece]
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]], list[str]]:
-    """Rows of all pieces, those of the pieces that broke off, and what failed in words."""
+    """Return the rows of all pieces, a row for each that broke off, and all failures in words."""
     rows, broken, failures = [], [], []
     with Progress(name, len(pieces), "pieces") as progress:
         for done, piece in enumerate(pieces):

@@ -17,22 +17,20 @@ def time_in_turn(
     uncounted: int,
     *,
     prepare: Callable[[int], Any] = int,
-    all_threads: bool = False,
 ) -> dict[str, float]:
-    """ms of processor time that each function takes, median, all in turn on a noisy machine.
+    """Return the median processor time (ms) of each function, called in turn on a noisy machine.
 
     Args:
-        work: by name; called ``count`` times with the result of ``prepare``.
-        uncounted: first calls, which may compile.
+        work: functions by name.
+        count: number of calls of each.
+        uncounted: number of first calls that do not count, since they may compile.
         prepare: makes the argument from the call's number; its time does not count.
-        all_threads: count every thread of the process.
     """
     found: dict[str, list[float]] = {name: [] for name in work}
     for k in range(count):
         for name, function in work.items():
             argument = prepare(k)
-            began = time.process_time() if all_threads else time.thread_time()
+            began = time.thread_time()
             function(argument)
-            ended = time.process_time() if all_threads else time.thread_time()
-            found[name].append(1e3 * (ended - began))
+            found[name].append(1e3 * (time.thread_time() - began))
     return {name: float(np.median(ms[uncounted:])) for name, ms in found.items()}

@@ -1,4 +1,4 @@
-"""The evaluated tissue solvers, one entry each; those of other packages are not evaluated.
+"""The evaluated tissue solvers, one entry each; solvers of other packages are not evaluated.
 
 >>> from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 >>> TISSUE_METHODS["msds"].is_dynamic, TISSUE_METHODS["msds"].settings[1]
@@ -27,25 +27,25 @@ Setting: TypeAlias = Mapping[str, Any]  # values of some of a solver's settings,
 
 @dataclass(frozen=True)
 class EvaluatedMethod:
-    """One solver."""
+    """One solver, and its settings in the evaluations."""
 
     name: str
     colour: str
     mark: str  # of its points in a plot, as Matplotlib names it
-    equations: Callable[[TissueModel], Forces]  # its equations, written down again
-    tried: tuple[Setting, ...] = ()  # besides the defaults
-    patient: Setting = field(default_factory=dict)  # settings with which it goes on until balance
-    is_dynamic: bool = False  # of springs and masses, in time steps that are stable up to a limit
+    equations: Callable[[TissueModel], Forces]  # its equations, written a second time
+    variants: tuple[Setting, ...] = ()  # besides the defaults
+    converging: Setting = field(default_factory=dict)  # settings with which it comes to balance
+    is_dynamic: bool = False  # has masses, and a limit of stable time steps
     is_judged_at_rest: bool = False  # under a held probe it must come to balance, nothing inverted
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """All that are tried, the defaults first."""
-        return ({}, *self.tried)
+        """All settings that are evaluated, the defaults first."""
+        return ({}, *self.variants)
 
 
 def _make_spring_equations(model: TissueModel) -> Forces:
-    """Write down the forces of the springs of Algorithm 1."""
+    """Make the forces of the springs of the paper's Algorithm 1."""
     springs = build_springs(model.mesh, model.materials)
     return lambda displacement: compute_spring_forces(
         springs.edges, springs.stiffness, model.mesh.nodes, displacement
@@ -66,8 +66,8 @@ _ALL = (
         mark="D",
         equations=_make_solid_equations(compute_neo_hookean_forces),
         is_judged_at_rest=True,
-        patient={"frame_tolerance": 1e-7, "most_iterations": 4000, "tolerance": 1e-7},
-        tried=(
+        converging={"frame_tolerance": 1e-7, "most_iterations": 4000, "tolerance": 1e-7},
+        variants=(
             {"frame_tolerance": 0.3, "most_iterations": 20},
             {"frame_tolerance": 0.1, "most_iterations": 60},
             {"frame_tolerance": 0.03},
@@ -79,19 +79,19 @@ _ALL = (
         colour="#56B4E9",
         mark="s",
         equations=_make_solid_equations(compute_hooke_forces),
-        tried=tuple({"iterations": n} for n in (5, 10, 40, 80, 160)),
+        variants=tuple({"iterations": n} for n in (5, 10, 40, 80, 160)),
     ),
     EvaluatedMethod(
         "msds",
         colour="#009E73",
         mark="^",
         equations=_make_spring_equations,
-        tried=({"steps": 5}, {"steps": 80}, {"stiffness": "fitted"}),
+        variants=({"steps": 5}, {"steps": 80}, {"stiffness": "fitted"}),
         is_dynamic=True,
     ),
 )
 TISSUE_METHODS = {method.name: method for method in _ALL}
-"""By name, in the reports' order; colours are told apart in every common colour blindness."""
+"""By name, in the reports' order; colours are distinct in every common colour blindness."""
 
 LOOKS = {method.name: LineLook(method.colour, method.mark) for method in _ALL}
-"""Of each method's line in a figure."""
+"""Look of each method's line in a figure."""

@@ -11,8 +11,8 @@ from us_sim.evaluation.hand import measure as following
 from us_sim.evaluation.hand import report as hand
 from us_sim.evaluation.hand.hand_motion import KINDS, HandMotion
 from us_sim.evaluation.hand.measure import (
-    BEGINS,
     CONVERGED,
+    FIRST,
     ArmMotion,
     ConvergedAnswer,
     follow_motion,
@@ -70,13 +70,13 @@ class Oracle:
 def test_what_knows_the_answer_has_no_error_and_skips_nothing(monkeypatch):
     live_by_its_own_clock(monkeypatch, solver := Oracle(answer()))
     row = follow_motion(solver, MOTION, answer())
-    assert row["frames"] == len(MOTION.poses) - BEGINS == 30
+    assert row["frames"] == len(MOTION.poses) - FIRST == 30
     assert row["error_mm_worst"] == row["live_skipped"] == row["frames_inverted"] == 0.0
 
 
 def test_what_has_not_converged_is_compared_with_nothing():
     known = answer()
-    known.residual[BEGINS + 4 :] = 0.1
+    known.residual[FIRST + 4 :] = 0.1
     row = follow_motion(Oracle(known), MOTION, known)
     assert row["not_compared"] == 26
     assert row["error_mm_worst"] == 0.0
@@ -106,7 +106,7 @@ def test_live_the_newest_pose_wins(monkeypatch):
     row = follow_motion(solver, MOTION, answer())
     expected = [int(0.040 * k * 60 + 1e-6) for k in range(25)]
     assert solver.seen == expected
-    counted = [k for k in expected if k >= BEGINS]
+    counted = [k for k in expected if k >= FIRST]
     assert row["live"]["number"].tolist() == counted
     assert row["live_skipped"] == pytest.approx(1 - len(counted) / 30)
     # A pose waits for the frame before, and then for its own.

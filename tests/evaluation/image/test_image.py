@@ -44,4 +44,4 @@ def test_what_is_asked_of_an_artefact_is_met(artefact, monkeypatch):
         if target.met is not None
     ]
     assert targets
-    assert [target.what for target in targets if not target.met] == []
+    assert [target.quantity for target in targets if not target.met] == []

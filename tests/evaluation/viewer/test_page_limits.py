@@ -17,7 +17,9 @@ def test_what_is_asked_is_compared_with_the_run_without_a_viewer():
         {"case": "1 browser, hand", **shown},
     ]
     table = pd.DataFrame(rows, columns=columns).assign(seconds=8.0)
-    seen = {target.what: (target.seen, target.met) for target in report_viewer(table).targets}
+    seen = {
+        target.quantity: (target.measured, target.met) for target in report_viewer(table).targets
+    }
     assert seen["images a second that the simulator loses to a page"] == ("15 %", False)
     assert seen["images a second in a browser, hand"] == ("26", True)
     assert seen["browser: likewise, 99th percentile"] == ("130 ms", False)

@@ -1,4 +1,4 @@
-"""Probe paths as a free hand moves them: smooth, random, as fast as asked, the same for a seed."""
+"""Random, smooth paths of a probe in a free hand, of a given speed and seed."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from us_sim.geometry.pose import Pose
 RATE = 60.0
 """Poses per second."""
 APPROACH = 0.5
-"""s before a motion, in which the probe comes to where it begins."""
+"""s before a motion, in which the probe comes to its start."""
 _Array = NDArray[np.float64]
 _Point = tuple[float, float, float]
 
 
 class HandSpeed(NamedTuple):
-    """How fast a hand is: medians over a motion."""
+    """Speeds of a hand: medians over a motion."""
 
     speed: float  # m/s, of the probe's face
     turning: float  # rad/s
@@ -36,22 +36,22 @@ HASTES = {
     "brisk": HandSpeed(0.060, math.radians(90)),
     "violent": HandSpeed(0.300, math.radians(360)),
 }
-"""By name, from a sonographer who looks to one who wants to break something."""
+"""By name, from a sonographer who looks to one who breaks things."""
 
 
 @dataclass(frozen=True)
 class HandMotion:
-    """A kind of motion, which moves or turns the probe, or both.
+    """A kind of motion: ranges of the probe's position and rotation.
 
-    The middle of the probe's face is between two points of ``patient``, whose xy plane is the skin;
-    angles are those of the probe from upright.
+    The middle of the probe's face is between two points in ``patient``, whose xy plane is the skin;
+    rotations are from upright.
     """
 
     words: str
     low: _Point  # m
     high: _Point  # m
     turn: _Point = (0.0, 0.0, 0.0)  # rad to either side: about z, then the probe's x and y
-    steep: float = 1.0  # how much a coordinate prefers the ends of its range; 1: none
+    steep: float = 1.0  # preference of coordinates for the ends of their ranges; 1: none
 
 
 _TILT = math.radians(25)
@@ -88,20 +88,20 @@ def make_hand_motion(kind: str, haste: str, seed: int, duration: float = 5.0) ->
     """Make a random motion of a hand, and its approach from above the skin.
 
     Each coordinate follows a sum of waves of a narrow band of frequencies and random phases, which
-    the error function maps to the coordinate's range: it is everywhere in it about equally often,
-    and never outside. How fast the curves are run through is chosen so that the median of the speed
-    from pose to pose is the one asked for, and the median of the turning likewise.
+    the error function maps to the coordinate's range: it is about uniform in the range, and never
+    outside. The curves' tempo is chosen for the median speed, and for the median turning, of the
+    haste.
 
     Args:
         kind: one of `KINDS`.
         haste: one of `HASTES`.
-        seed: not negative; another number gives another motion.
-        duration: s, without the approach, whose speed is none of the motion's.
+        seed: not negative; another seed gives another motion.
+        duration: s, without the approach.
 
     Returns:
         ``RATE * (APPROACH + duration)`` poses in frame ``patient``.
     """
-    motion, asked = KINDS[kind], HASTES[haste]
+    motion, wanted = KINDS[kind], HASTES[haste]
     low, high, angles = np.array([motion.low, motion.high, motion.turn])
     # The same number must not give the kinds' coordinates the same curves.
     random = np.random.default_rng([seed, zlib.crc32(f"{kind} {haste}".encode())])
@@ -120,16 +120,16 @@ def make_hand_motion(kind: str, haste: str, seed: int, duration: float = 5.0) ->
         turned = compute_rotations(times)
         return np.asarray(RATE * (turned[:-1].inv() * turned[1:]).magnitude())
 
-    coming = round(RATE * APPROACH)
+    approaching = round(RATE * APPROACH)
     times = np.arange(round(RATE * duration)) / RATE
-    begun = np.concatenate([np.zeros(coming), times])
+    begun = np.concatenate([np.zeros(approaching), times])
     positions = compute_positions(
-        begun * (_find_tempo(measure_speeds, asked.speed, times) if np.any(high > low) else 0.0)
+        begun * (_find_tempo(measure_speeds, wanted.speed, times) if np.any(high > low) else 0.0)
     )
     turns = compute_rotations(
-        begun * (_find_tempo(measure_turning, asked.turning, times) if angles.any() else 0.0)
+        begun * (_find_tempo(measure_turning, wanted.turning, times) if angles.any() else 0.0)
     )
-    part = np.arange(coming) / coming
+    part = np.arange(approaching) / approaching
     # From rest to rest as a hand moves (Flash and Hogan 1985).
     smooth = part**3 * (10 - 15 * part + 6 * part**2)
     present = np.concatenate([smooth, np.ones_like(times)])[:, None]
@@ -141,7 +141,7 @@ def make_hand_motion(kind: str, haste: str, seed: int, duration: float = 5.0) ->
 
 
 def _make_curves(random: np.random.Generator, steep: float) -> Callable[[_Array], _Array]:
-    """Three random curves of times (K,), with values (K, 3) from 0 to 1."""
+    """Make three random curves of times (K,), with values (K, 3) from 0 to 1."""
     count = 6
     frequency = random.uniform(0.4, 1.6, (count, 3))  # cycles of the curve's own unit of time
     phase = random.uniform(0.0, 2 * np.pi, (count, 3))
@@ -155,7 +155,7 @@ def _make_curves(random: np.random.Generator, steep: float) -> Callable[[_Array]
 
 
 def _find_tempo(speeds: Callable[[_Array], _Array], asked: float, times: _Array) -> float:
-    """Find how many of its units a curve runs through in a second for its median speed."""
+    """Find the tempo, units of a curve in a second, for which its median speed is ``asked``."""
 
     def compute_excess(tempo: float) -> float:
         return float(np.median(speeds(tempo * times))) - asked

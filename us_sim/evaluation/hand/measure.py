@@ -1,12 +1,11 @@
-"""How tissue follows a random motion of a hand: first every pose fed, then live.
+"""Tissue that follows a random motion of a hand: first with every pose, then live.
 
-Nodes are compared with the converged answer: a ``fem_nonlinear`` with the settings with which it
-converges follows the poses in order, and is called again at each until it has converged, or goes no
-further.
+Nodes are compared with the converged answer: ``fem_nonlinear``, with settings with which it
+converges, follows the poses in order, and is called at each until it has converged or stalls.
 
 >>> from us_sim.evaluation.hand.measure import list_motions
 >>> list_motions(quick=True, seed=1)[0]
-Motion(kind='free', haste='brisk', seed=1, duration=2.0)
+ArmMotion(kind='free', haste='brisk', seed=1, duration=2.0)
 """
 
 from __future__ import annotations
@@ -34,17 +33,17 @@ from us_sim.tissue.solvers.frame_budget import FramePace
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
 METHOD = "fem_nonlinear"  # the method whose converged frames are the answer
-BEGINS = round(APPROACH * RATE)  # the frame after the approach, whose frames do not count
+FIRST = round(APPROACH * RATE)  # number of the first frame that counts, after the approach
 CONVERGED = 1e-5  # residual at which a pose is left for the next
 TRUSTED = 1e-3  # residual of the answer above which nothing is compared with it
-AWAY = 1.0  # mm to the converged answer, beyond which tissue is elsewhere
+AWAY = 1.0  # mm to the converged answer, above which a node counts as away
 
 _Array = NDArray[np.float64]
 
 
 @cache
 def load_arm() -> TissueModel:
-    """The tissue of the scene ``upper_arm``."""
+    """Load the tissue of the scene ``upper_arm``."""
     scene = load_scene("upper_arm")
     return build_tissue_model(scene, load_volume(scene))
 
@@ -60,12 +59,12 @@ class ArmMotion:
 
     @cached_property
     def poses(self) -> list[Pose]:
-        """One pose a frame, those of the approach first."""
+        """Poses, one a frame, those of the approach first."""
         return make_hand_motion(self.kind, self.haste, self.seed, self.duration)
 
 
 def list_motions(quick: bool, seed: int) -> list[ArmMotion]:
-    """All motions that are measured: the free hand in every haste, others in the middle one."""
+    """List the motions: the free hand in every haste, other kinds in the middle one."""
     if quick:
         return [
             ArmMotion("free", "brisk", seed, 2.0),
@@ -81,22 +80,22 @@ class ConvergedAnswer:
     """The converged answer at each of K poses."""
 
     nodes: _Array  # (K, N, 3) m
-    residual: _Array  # (K,) as the solver said in the end
+    residual: _Array  # (K,) as the solver reported it
 
 
 def follow_to_convergence(model: TissueModel, poses: Sequence[Pose]) -> ConvergedAnswer:
     """Follow the poses, each to convergence."""
-    solver = create_solver(METHOD, model, **TISSUE_METHODS[METHOD].patient)
+    solver = create_solver(METHOD, model, **TISSUE_METHODS[METHOD].converging)
     found = [_settle_at(solver, pose) for pose in poses]
     nodes = np.array([deformation.nodes for deformation in found])
     return ConvergedAnswer(nodes, np.array([deformation.residual for deformation in found]))
 
 
 def _settle_at(solver: TissueSolver, pose: Pose) -> Deformation:
-    """The best of up to 20 frames at one pose: until it settles, or goes no further.
+    """Return the best of up to 20 frames at one pose, until the solver settles or stalls.
 
-    Of frames in balance the last is the best: in the earlier ones the probe is still sunk in. It
-    goes no further where in four calls the least residual has not fallen by a factor of 0.7.
+    Of frames in balance the last is the best: in earlier ones the probe is still sunk in. The
+    solver stalls if the least residual has not fallen to 0.7 of itself in four calls.
     """
     found = solver.deform(pose)
     best = [found]
@@ -150,7 +149,7 @@ def follow_motion(
         "frames_inverted": int((frames["inverted"] > 0).sum()),
         **_name_percentiles("cpu_ms", frames["cpu"], (50, 99, 100)),
         **_name_percentiles("wall_ms", frames["wall"], (50, 99, 100)),
-        "live_skipped": 1.0 - len(live) / (len(motion.poses) - BEGINS),
+        "live_skipped": 1.0 - len(live) / (len(motion.poses) - FIRST),
         **_name_percentiles("live_error_mm", live["error"], (50, 100)),
         "live_away_ms": compute_longest_away(live),
         **_name_percentiles("live_latency_ms", live["latency"], (50, 99, 100)),
@@ -163,17 +162,17 @@ def follow_motion(
 def _name_percentiles(
     name: str, values: pd.Series[float], percents: Sequence[int]
 ) -> dict[str, object]:
-    """By column: ``name_p50``, and ``name_worst`` for 100."""
+    """Return percentiles by column: ``name_p50``, and ``name_worst`` for 100."""
     return {
         f"{name}_{'worst' if p == 100 else f'p{p}'}": values.quantile(p / 100) for p in percents
     }
 
 
 def compute_longest_away(live: pd.DataFrame) -> float:
-    """The longest time (ms) that a node is shown farther than `AWAY` from where it belongs."""
+    """Compute the longest time (ms) in which a shown node is over `AWAY` from its answer."""
     number = live["number"].to_numpy()
     longest, lasted = 0, 0  # poses
-    until = np.append(number, number[-1:] + 1)[1:]  # it is shown
+    until = np.append(number, number[-1:] + 1)[1:]  # the next is shown
     for poses, error in zip(until - number, live["error"], strict=True):
         lasted = lasted + poses if error > AWAY else 0
         longest = max(longest, lasted)
@@ -183,17 +182,17 @@ def compute_longest_away(live: pd.DataFrame) -> float:
 def _follow_every_pose(
     solver: TissueSolver, motion: ArmMotion, answer: ConvergedAnswer
 ) -> pd.DataFrame:
-    """Leave no pose out, however long a frame takes."""
+    """Follow every pose, however long a frame takes."""
     solver.reset()
     rows = [_measure_frame(solver, motion, answer, k) for k in range(len(motion.poses))]
-    return pd.DataFrame(rows[BEGINS:], columns=FollowedFrame._fields)
+    return pd.DataFrame(rows[FIRST:], columns=FollowedFrame._fields)
 
 
 def _follow_live(solver: TissueSolver, motion: ArmMotion, answer: ConvergedAnswer) -> pd.DataFrame:
-    """Take poses at their times, each frame the newest of them; with the ``latency``, ms.
+    """Follow poses at their times, in each frame the newest; with the ``latency``, ms.
 
-    The clock is the wall's while a frame is made; waiting for a pose takes no time. A frame may
-    take as long as `FramePace` says, as in the node, which needs 0.5 ms to send its result.
+    The clock runs while a frame is made, and skips the wait for a pose. `FramePace` limits the time
+    of a frame, as in the node, which needs 0.5 ms to send its result.
     """
     solver.reset()
     rows: list[dict[str, float]] = []
@@ -213,7 +212,7 @@ def _follow_live(solver: TissueSolver, motion: ArmMotion, answer: ConvergedAnswe
         rows.append({**row._asdict(), "latency": 1e3 * (now - newest / RATE)})
     solver.frame_limit = None
     frames = pd.DataFrame(rows)
-    return frames[frames["number"] >= BEGINS].reset_index(drop=True)
+    return frames[frames["number"] >= FIRST].reset_index(drop=True)
 
 
 def _measure_frame(
@@ -246,6 +245,6 @@ def _make_solver(method: str) -> TissueSolver:
 
 
 def measure_motion(motion: ArmMotion, method: str) -> list[dict[str, Any]]:
-    """Row of a method; the answer of the last motion is kept, and the solvers."""
+    """Measure the row of a method; keep the answer of the last motion, and the solvers."""
     with threadpool_limits(1):
         return [follow_motion(_make_solver(method), motion, _compute_answer(motion))]

@@ -1,4 +1,4 @@
-"""`us-sim evaluate hand`: how far the tissue of every method is behind a hand."""
+"""`us-sim evaluate hand`: error and delay of every method behind a hand."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from us_sim.evaluation.settings import HandSettings
 from us_sim.evaluation.subject import Piece, Report, Subject, Target
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 
-JUDGED = "fem_nonlinear"  # the method that the targets are for
+JUDGED = "fem_nonlinear"  # the method of the targets
 
 
 def _plan_pieces(
@@ -33,7 +33,7 @@ def _plan_pieces(
 
 
 def _join_frames(table: pd.DataFrame, frames: str) -> pd.DataFrame:
-    """Every frame of some rows, with the row's motion and method."""
+    """Join the frames of all rows, each with its row's motion and method."""
     rows = [
         row[frames].assign(motion=row["motion"], method=row["method"])
         for _, row in table.iterrows()
@@ -47,12 +47,12 @@ def _report(table: pd.DataFrame) -> Report:
     table = table.assign(motion=table["kind"] + ", " + table["haste"])
     judged = table[table["method"] == JUDGED]
     brisk = table[table["haste"] == "brisk"]
-    mine = brisk[brisk["method"] == JUDGED]
-    every, live = _join_frames(mine, "every"), _join_frames(mine, "live")
+    ours = brisk[brisk["method"] == JUDGED]
+    every, live = _join_frames(ours, "every"), _join_frames(ours, "live")
     balanced = 100 * (every["residual"] <= 1e-2).mean()
     wrong = (judged["frames_inverted"] + judged["live_frames_inverted"]).sum()
-    late, skipped = live["latency"].quantile(0.99), 100 * mine["live_skipped"].mean()
-    away = mine["live_away_ms"].max()
+    late, skipped = live["latency"].quantile(0.99), 100 * ours["live_skipped"].mean()
+    away = ours["live_away_ms"].max()
     limits: Sequence[tuple[str, float, float, str]] = (
         ("brisk: ms a frame (processor), median", 8, every["cpu"].median(), "ms"),
         ("brisk: likewise, 99th percentile", 33, every["cpu"].quantile(0.99), "ms"),
@@ -100,14 +100,12 @@ def _report(table: pd.DataFrame) -> Report:
             limits={"16.7 ms: 60 Hz": 1e3 / RATE},
             labels={"ms": "processor time of a frame, ms", "mm": "error of the worst node, mm"},
         ),
-        "motions": table[
-            ["kind", "haste", "method", "error_mm_p50", "error_mm_p99", "residual_p50"]
-            + ["frames_inverted", "cpu_ms_p50", "cpu_ms_p99"]
-        ],
-        "live": table[
-            ["kind", "haste", "method", "live_skipped", "live_error_mm_p50", "live_error_mm_worst"]
-            + ["live_away_ms", "live_latency_ms_p99"]
-        ],
+        "motions": table.filter(
+            regex="^(kind|haste|method|(error_mm|cpu_ms)_p(50|99)|residual_p50|frames_inverted)$"
+        ),
+        "live": table.filter(
+            regex="^(kind|haste|method|live_(skipped|error_mm_.*|away_ms|latency_ms_p99))$"
+        ),
         "kinds": [f"{name}: {kind.words}" for name, kind in KINDS.items()],
     }
     return Report(take_home, places, targets)

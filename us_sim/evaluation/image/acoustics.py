@@ -1,4 +1,4 @@
-"""Loss along beams and the edges of shadows in images, against closed forms.
+"""Loss along beams and edges of shadows in images, against closed forms.
 
 >>> from us_sim.evaluation.image.acoustics import compute_loss
 >>> down = np.array([0.0, 0.0, 1.0])
@@ -34,13 +34,13 @@ LAYERS = {
     "blood": (0.0213, 0.14, 1.679e6),
     "muscle": (0.0301, 0.9, 1.645e6),
 }
-"""m along z of ``patient`` where a tissue begins, its attenuation (dB/cm/MHz), impedance (Rayl)."""
+"""Of each tissue: z (m) in ``patient`` of its top, attenuation (dB/cm/MHz), impedance (Rayl)."""
 
 _live = partial(Acoustics, artefacts="live", surfaces=False)
 
 
 def measure_attenuation(quick: bool) -> Iterator[dict[str, Any]]:
-    """Images of layers of one grey, whose levels are the loss alone; the worst depth of each."""
+    """Measure loss through layers: the worst depth of images of voxels of one grey."""
     begins = [begin for begin, *_ in LAYERS.values()]
     volume = _make_volume(
         LAYERS,
@@ -70,20 +70,23 @@ def measure_attenuation(quick: bool) -> Iterator[dict[str, Any]]:
 
 
 def compute_loss(start: Array, direction: Array, distance: Array, frequency: float) -> Array:
-    """dB by which echoes at distances (…,) m along beams are changed (Beer and Lambert).
+    """Compute the gain (dB) of echoes at distances along beams (Beer and Lambert).
 
     Args:
-        start, direction: (…, 3) m and unit, in ``patient``. frequency: Hz.
+        start: (…, 3) m, in ``patient``.
+        direction: (…, 3) unit vector, in ``patient``.
+        distance: (…,) m.
+        frequency: Hz.
     """
     z = start[..., 2]
     end = z + direction[..., 2] * distance
     upper, lower = np.minimum(z, end), np.maximum(z, end)
-    # Where a beam runs along the layers all of it is in one.
+    # A beam along the layers is all in one of them.
     per_depth = np.abs(np.divide(distance, end - z, out=np.zeros_like(end), where=end != z))
     level = np.zeros_like(end)
     begins, attenuations, impedances = np.array(list(LAYERS.values())).T
-    for begin, end_of, attenuation in zip(begins, [*begins[1:], np.inf], attenuations, strict=True):
-        within = np.clip(np.minimum(lower, end_of) - np.maximum(upper, begin), 0, None)
+    for top, bottom, attenuation in zip(begins, [*begins[1:], np.inf], attenuations, strict=True):
+        within = np.clip(np.minimum(lower, bottom) - np.maximum(upper, top), 0, None)
         level -= 2.0 * 100.0 * attenuation * frequency * 1e-6 * within * per_depth
     for begin, above, below in zip(begins[1:], impedances, impedances[1:], strict=False):
         passed = (upper < begin) & (lower >= begin)
@@ -92,7 +95,7 @@ def compute_loss(start: Array, direction: Array, distance: Array, frequency: flo
 
 
 def _compute_expected_levels(probe: Probe, pose: Pose, acoustics: Acoustics) -> Array:
-    """(rows, columns) dB by which each pixel is changed; NaN where no beam reaches."""
+    """Compute the gain (rows, columns) dB of each pixel; NaN if no beam reaches it."""
     assert acoustics.frequency is not None
     line, distance = probe.pixel_beams.astype(np.float64)
     starts, directions = probe.compute_rays(((line + 0.5) / probe.lines).reshape(-1))
@@ -107,7 +110,7 @@ def _compute_expected_levels(probe: Probe, pose: Pose, acoustics: Acoustics) -> 
 def _find_worst_depth(
     probe: Probe, image: NDArray[np.uint8], expected: Array
 ) -> tuple[float, float, float]:
-    """Depth (m) with the greatest error of its mean, and that mean: expected and shown, dB."""
+    """Find the depth (m) whose mean is most wrong, and that mean: expected and shown, dB."""
     grey = GREY + GREYS_PER_DECIBEL * expected
     usable = (grey > 4.0) & (grey < 250.0)  # between which a mean is not clipped
     shown = expected + (image - grey) / GREYS_PER_DECIBEL
@@ -130,11 +133,11 @@ STATES = {
     "pressed": (np.array([[1.06, 0.0, 0.08], [0.0, 1.07, 0.0], [0.0, 0.0, 0.88]]), 0.0),
     "slid": (np.eye(3), 3.7e-3),
 }
-"""Gradients (3, 3) of the deformation around the bone, and m by which the probe is slid along x."""
+"""Deformation gradient (3, 3) around the bone, and slide (m) of the probe along x."""
 
 
 def measure_shadows(quick: bool) -> Iterator[dict[str, Any]]:
-    """A shadow of bone at rest, pressed, and as the probe slides: half of the amplitude is left."""
+    """Measure the edges of a bone's shadow, at half of the amplitude: at rest, pressed and slid."""
     (left, right), (top, bottom) = BLOCK
     volume = _make_volume(
         ("muscle", "bone"),
@@ -147,7 +150,7 @@ def measure_shadows(quick: bool) -> Iterator[dict[str, Any]]:
     carrier = box_mesh(*(uniform_planes(*side, n) for side, n in sides))
     tissues = {
         "muscle": TissueAcoustics(attenuation=0.57, impedance=1.645e6),
-        # Opaque: sound that bone lets through would move the place of half of the amplitude.
+        # Opaque: sound through the bone would move the edge.
         "bone": TissueAcoustics(attenuation=20.0, impedance=1e8),
     }
     probes: Mapping[str, tuple[Probe, float]] = {
@@ -170,7 +173,7 @@ def measure_shadows(quick: bool) -> Iterator[dict[str, Any]]:
 
 
 def _find_beams(probe: Probe, pose: Pose, points: Array) -> Array:
-    """(n,) place among all beams, 0 to 1, of those through points (n, 3) m, by bisection."""
+    """Find the beams through points (n, 3) m, by bisection: places (n,) from 0 to 1."""
     x, _, z = ((points - pose.position) @ pose.rotation).T
     low, high = np.zeros(len(x)), np.ones(len(x))
     for _ in range(50):
@@ -184,7 +187,7 @@ def _find_beams(probe: Probe, pose: Pose, points: Array) -> Array:
 def _find_edges(
     probe: Probe, image: NDArray[np.uint8], places: Array, depth: float
 ) -> Iterator[tuple[float, float]]:
-    """Both edges of a shadow at a depth, expected and shown: pixels from the middle, on the arc."""
+    """Find a shadow's edges at a depth, expected and shown: pixels on the arc from its middle."""
     line, distance = probe.pixel_beams
     near = np.abs(distance - depth) < 1.5 * probe.pixel_spacing[1]
     place = (line[near] + 0.5) / probe.lines
@@ -214,7 +217,7 @@ def _make_volume(
     extent: Sequence[tuple[float, float]],
     label: Callable[[Array, Array], NDArray[Any]],
 ) -> Volume:
-    """Voxels (m) of one grey that fill an extent (m); the label is a function of x and z (m)."""
+    """Make voxels (m) of one grey that fill an extent (m), with labels by x and z (m)."""
     x, y, z = (
         low + step * (np.arange(round((high - low) / step), dtype=np.float64) + 0.5)
         for (low, high), step in zip(extent, voxel, strict=True)

@@ -36,12 +36,10 @@ def make_row(
     measured: float,
     unit: str,
 ) -> dict[str, Any]:
-    """Row of one expected number, and the one that the image shows.
+    """Make the row of a number expected and one measured in the image.
 
-    Args:
-        artefact: a word, or several with underscores.
-        tilt: degrees. depth: m.
-        unit: the error of levels in dB is that of the amplitude, of pixels in hundredths of one.
+    The error of dB is that of the amplitude, in percent; that of other units is 100 times the
+    difference. The tilt is in degrees, the depth in m.
     """
     if unit == "dB":
         error = 100.0 * (10.0 ** ((measured - expected) / 20.0) - 1.0)
@@ -60,13 +58,13 @@ def make_row(
 
 
 def make_tilted_pose(degrees: float, *, elevational: bool = False) -> Pose:
-    """A probe at the origin, turned about y in its image's plane, or about x out of it."""
+    """Make the pose of a probe at the origin, turned about y in its image plane, or about x."""
     turn = Rotation.from_euler("x" if elevational else "y", degrees, degrees=True)
     return Pose(np.zeros(3), turn.as_quat())
 
 
 def make_arm_images() -> dict[str, dict[str, NDArray[np.uint8]]]:
-    """Images by what they show, and by the tilt of a probe that turns about the bone."""
+    """Make images by the acoustics, and by the tilt of a probe that turns about the bone."""
     scene = load_scene("upper_arm")
     volume, side = load_volume(scene), 320
     deep: Any = build_probe(scene)
@@ -91,7 +89,7 @@ def make_arm_images() -> dict[str, dict[str, NDArray[np.uint8]]]:
 
 
 def measure_run_times(quick: bool) -> Iterator[dict[str, Any]]:
-    """Images of 512 × 512 of the pressed arm, in turn, so that all have the same disturbances."""
+    """Time images of 512 × 512 of the pressed arm, in turn, with the same disturbances."""
     scene = load_scene("upper_arm")
     volume, probe = load_volume(scene), build_probe(scene).with_pixels(512, 512)
     full = scene.imaging.acoustics
@@ -128,8 +126,8 @@ def measure_run_times(quick: bool) -> Iterator[dict[str, Any]]:
     try:
         medians = time_in_turn(
             {name: make_imager(acoustics, name == "strain") for name, acoustics in kinds.items()},
-            60 if quick else 300,
-            5,
+            count=60 if quick else 300,
+            uncounted=5,
             prepare=lambda number: Pose(np.array([2e-4 * (number % 7), 0.0, press])),
         )
     finally:

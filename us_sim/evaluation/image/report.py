@@ -29,7 +29,7 @@ def _plan_pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
 
 
 def report_image(table: pd.DataFrame) -> Report:
-    """What the table says of sound; what failed is not known."""
+    """Report the errors and run times of the table; a failed piece has none."""
     table = table.assign(off=(table["measured"] - table["expected"]).abs())
 
     def find_worst(artefact: str, column: str) -> float:
@@ -55,7 +55,8 @@ def report_image(table: pd.DataFrame) -> Report:
     )
     take_home = [
         f"Loss through layers is {loss:.2g} % off in amplitude at worst.",
-        f"A shadow's edge is {find_worst('shadow_edge', 'off'):.2g} pixels off, at rest and pressed.",
+        f"A shadow's edge is {find_worst('shadow_edge', 'off'):.2g} pixels off, at rest and "
+        f"pressed.",
         f"An image of 512 × 512 takes {ms['slice']:.2f} ms of a core, with strain "
         f"{ms['strain']:.2f} ms, with all acoustics {ms['all']:.2f} ms.",
     ]

@@ -1,4 +1,4 @@
-"""Waits for images, and notes when each message on the way to them arrives."""
+"""A node that records the arrival of each message from a pose to its image."""
 
 from __future__ import annotations
 
@@ -23,36 +23,36 @@ HOPS = {
 }
 """Topics that carry the stamp of the tracker's pose, in the order of the graph."""
 
-_HEADER = struct.Struct("<4xiI")  # where a serialized message with a header has its stamp
+_HEADER = struct.Struct("<4xiI")  # the stamp of a serialized message with a header
 
 
 def read_stamp(data: bytes) -> int:
-    """The stamp, ns, of a serialized message with a header."""
+    """Read the stamp (ns) of a serialized message with a header."""
     seconds, nanoseconds = _HEADER.unpack_from(data)
     return int(1_000_000_000 * seconds + nanoseconds)
 
 
 class Arrivals(Node):  # type: ignore[misc]
-    """Subscribes to topics without looking at more of their messages than the stamps."""
+    """Stamps and times of arrival of the messages of `HOPS`; it reads only the stamps."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("arrivals", **kwargs)
-        self._heard: dict[str, list[tuple[int, int]]] = {topic: [] for topic in HOPS}
+        self._arrivals: dict[str, list[tuple[int, int]]] = {topic: [] for topic in HOPS}
         for topic, kind in HOPS.items():
-            note = partial(self._record_arrival, self._heard[topic])
-            self.create_subscription(kind, topic, note, EVERY, raw=True)
+            record = partial(self._record_arrival, self._arrivals[topic])
+            self.create_subscription(kind, topic, record, EVERY, raw=True)
 
     def list_arrivals(self, topic: str) -> Sequence[tuple[int, int]]:
-        """Stamp and time of arrival of every message so far, ns."""
-        return list(self._heard[topic])
+        """Return stamp and time of arrival (ns) of every message so far."""
+        return list(self._arrivals[topic])
 
     def list_arrivals_between(self, began: int, ended: int) -> dict[str, list[tuple[int, int]]]:
-        """Stamps and arrivals by topic, of messages stamped from ``began`` until ``ended``, ns."""
+        """Return arrivals by topic, of messages with stamps from ``began`` until ``ended`` (ns)."""
         return {
             topic: [each for each in self.list_arrivals(topic) if began <= each[0] < ended]
-            for topic in self._heard
+            for topic in HOPS
         }
 
     @staticmethod
-    def _record_arrival(heard: list[tuple[int, int]], data: bytes) -> None:
-        heard.append((read_stamp(data), time.time_ns()))
+    def _record_arrival(arrivals: list[tuple[int, int]], data: bytes) -> None:
+        arrivals.append((read_stamp(data), time.time_ns()))

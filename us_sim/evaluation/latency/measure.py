@@ -1,4 +1,4 @@
-"""Run the arm in many ways, one thing changed at a time, and listen to its graph.
+"""Run the arm in many ways, one change at a time, and record the messages of its graph.
 
 >>> from us_sim.evaluation.latency.measure import list_cases
 >>> [str(case) for case in list_cases(quick=True)][:2]
@@ -38,18 +38,18 @@ class LatencyCase:
     solver: str = "fem"
     image: str = "512x512"  # columns and rows
     recorder: bool = True
-    cores_busy: bool = False  # with something else
+    cores_busy: bool = False  # with other programs
     seconds: float = 20.0
-    realtime: bool = True  # the nodes go before ordinary programs, where the system allows that
+    realtime: bool = True  # nodes go before ordinary programs, if the system allows it
 
     def __str__(self) -> str:
-        words = {
+        parts = {
             f"{self.solver}, {self.image}": True,
             "recorder": self.recorder,
             "cores busy": self.cores_busy,
             "as ordinary programs": not self.realtime,
         }
-        return ", ".join(word for word, is_said in words.items() if is_said)
+        return ", ".join(part for part, is_named in parts.items() if is_named)
 
 
 DEMO = LatencyCase("fem_nonlinear", seconds=130.0)  # the method of the demo
@@ -57,7 +57,7 @@ BUSY = replace(DEMO, cores_busy=True, seconds=20.0)
 
 
 def list_cases(quick: bool) -> list[LatencyCase]:
-    """Cases of a run; a quick one has a few, of some seconds each."""
+    """List the cases; a quick run has a few, of some seconds each."""
     base, ordinary = LatencyCase(), replace(BUSY, realtime=False)
     if quick:
         return [replace(case, seconds=8.0) for case in (base, DEMO, BUSY, ordinary)]
@@ -74,7 +74,7 @@ def list_cases(quick: bool) -> list[LatencyCase]:
 
 
 def run_case(case: LatencyCase) -> list[dict[str, Any]]:
-    """Run the arm as the case says, and return its row.
+    """Run the arm as in the case, and return its row.
 
     Raises:
         UsSimError: the simulation ends, or no image comes.
@@ -83,16 +83,16 @@ def run_case(case: LatencyCase) -> list[dict[str, Any]]:
 
     with tempfile.TemporaryDirectory(prefix="us_sim_latency_") as name:
         scene, session = Path(name) / "scene.yaml", Path(name) / "session.mcap"
-        image = f"[{case.image.replace('x', ', ')}]"
-        changes = f"probe: {{image: {image}}}\ntissue: {{solver: {case.solver}}}\n"
+        size = f"[{case.image.replace('x', ', ')}]"
+        changes = f"probe: {{image: {size}}}\ntissue: {{solver: {case.solver}}}\n"
         scene.write_text(f"name: latency\nbased_on: upper_arm\n{changes}")
-        words = ["run", str(scene), "--path", str(find_bag("press_and_slide.mcap"))]
-        words += ["--param", "path_player.loop=true"]
-        words += ["--record", str(session)] if case.recorder else []
+        arguments = ["run", str(scene), "--path", str(find_bag("press_and_slide.mcap"))]
+        arguments += ["--param", "path_player.loop=true"]
+        arguments += ["--record", str(session)] if case.recorder else []
         for node in ("probe_tracker", "tissue_deformer", "skin_deformer", "slice_interpolator"):
-            words += ["--param", f"{node}.realtime={str(case.realtime).lower()}"]
+            arguments += ["--param", f"{node}.realtime={str(case.realtime).lower()}"]
         busy = _keep_cores_busy() if case.cores_busy else contextlib.nullcontext()
-        with record_arrivals() as arrivals, busy, run_simulator(*words) as simulation:
+        with record_arrivals() as arrivals, busy, run_simulator(*arguments) as simulation:
             simulation.await_image(arrivals)
             time.sleep(2.0)  # these images do not count
             pids = {node: pid for pid, node in find_descendants(simulation.process.pid).items()}
@@ -106,30 +106,34 @@ def run_case(case: LatencyCase) -> list[dict[str, Any]]:
                 time.sleep(0.5)
             ended_ns = time.time_ns()
             time.sleep(1.5)  # for messages under way to arrive, and to be recorded
-            heard = arrivals.list_arrivals_between(began_ns, ended_ns)
+            messages = arrivals.list_arrivals_between(began_ns, ended_ns)
         recorded = None
         if case.recorder:
-            there = read_bag(session).read_messages(["/ultrasound/image"])
-            stamps = {stamp for stamp, _ in heard["ultrasound/image"]}
-            recorded = len(stamps & {read_stamp(message.data) for message in there})
-    return [{"scheduling": scheduling, **make_row(heard, recorded, usage.make_columns())}]
+            images = read_bag(session).read_messages(["/ultrasound/image"])
+            stamps = {stamp for stamp, _ in messages["ultrasound/image"]}
+            recorded = len(stamps & {read_stamp(image.data) for image in images})
+    return [{"scheduling": scheduling, **make_row(messages, recorded, usage.make_columns())}]
 
 
 def make_row(
-    heard: Mapping[str, Sequence[tuple[int, int]]], recorded: int | None, usage: Mapping[str, float]
+    messages: Mapping[str, Sequence[tuple[int, int]]],
+    recorded: int | None,
+    usage: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Row of what was heard by topic, in their order, and of the usage.
+    """Make the row of a case.
 
     Args:
-        heard: stamps and times of arrival, ns, by topic.
-        recorded: number of the images that were heard and recorded; None without a recorder.
+        messages: stamps and times of arrival (ns) by topic, in the order of the graph.
+        recorded: number of arrived images that were also recorded; None without a recorder.
         usage: columns of `UsageOverTime`.
     """
-    ages = {topic: np.array([1e-6 * (b - a) for a, b in pairs]) for topic, pairs in heard.items()}
+    ages = {
+        topic: np.array([1e-6 * (b - a) for a, b in pairs]) for topic, pairs in messages.items()
+    }
     age = ages["ultrasound/image"]
-    stamps, came = np.array(heard["ultrasound/image"], dtype=np.int64).reshape(-1, 2).T
+    stamps, came = np.array(messages["ultrasound/image"], dtype=np.int64).reshape(-1, 2).T
     passed = 1e-9 * np.ptp(came) if len(came) else 0.0
-    poses = np.array([stamp for stamp, _ in heard["tracker/pose"]])
+    poses = np.array([stamp for stamp, _ in messages["tracker/pose"]])
     # Of the poses between the first and the last image.
     missed = np.setdiff1d(poses, stamps)
     missed = missed[(missed > stamps.min(initial=2**62)) & (missed < stamps.max(initial=0))]
@@ -149,7 +153,7 @@ def make_row(
             if topic != "tracker/pose"
             for name, percent in (("p50", 50), ("p99", 99), ("worst", 100))
         },
-        "image_mm_p50": 0.1 * compute_percentile(age, 50),  # that a hand goes at 0.1 m/s
+        "image_mm_p50": 0.1 * compute_percentile(age, 50),  # way of a hand at 0.1 m/s
         "image_mm_p99": 0.1 * compute_percentile(age, 99),
         **{name: value for name, value in usage.items() if name.startswith("cores_")},
         "cores_all": sum(select_usage("cores_")),
@@ -160,9 +164,9 @@ def make_row(
 
 @contextlib.contextmanager
 def _keep_cores_busy() -> Iterator[None]:
-    """Something else that takes all it can get of every core."""
-    work = [sys.executable, "-c", "while True: pass"]
-    busy = [subprocess.Popen(work) for _ in range(os.cpu_count() or 1)]
+    """Keep every core busy with an ordinary program."""
+    loop = [sys.executable, "-c", "while True: pass"]
+    busy = [subprocess.Popen(loop) for _ in range(os.cpu_count() or 1)]
     try:
         yield
     finally:

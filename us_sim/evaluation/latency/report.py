@@ -1,4 +1,4 @@
-"""`us-sim evaluate latency`: how old a pose is when its image comes, hop by hop."""
+"""`us-sim evaluate latency`: age of a pose when its image comes, hop by hop."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _plan_pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
 
 def _report(table: pd.DataFrame) -> Report:
     def get_value(case: LatencyCase, column: str) -> float:
-        """The value of a case, however long it was."""
+        """Return the value of a case, of whatever length; NaN if it failed."""
         rows = table[table["case"] == str(case)]
         return float(rows[column].iloc[0]) if len(rows) else np.nan
 
@@ -51,12 +51,13 @@ def _report(table: pd.DataFrame) -> Report:
         f"With `fem` an image is {get_value(LatencyCase(), age):.3g} ms old when it comes, "
         f"{get_value(LatencyCase(), worst):.3g} ms at the 99th percentile, at "
         f"{get_value(LatencyCase(), 'images_a_second'):.3g} images a second of 60 poses.",
-        f"`fem_nonlinear`, as in the demo: {image:.3g} and {get_value(DEMO, worst):.3g} ms; of these "
-        f"{pose:.2g} ms to the filtered pose, {nodes - pose:.2g} to the tissue and "
+        f"`fem_nonlinear`, as in the demo: {image:.3g} and {get_value(DEMO, worst):.3g} ms; of "
+        f"these {pose:.2g} ms to the filtered pose, {nodes - pose:.2g} to the tissue and "
         f"{image - nodes:.2g} from there to the image.",
         f"A hand at 100 mm/s is {get_value(DEMO, 'image_mm_p50'):.2g} mm farther by then.",
         f"With every core busy with something else, nodes that go first give "
-        f"{get_value(BUSY, 'images_a_second'):.3g} images a second, {get_value(BUSY, worst):.3g} ms at p99.",
+        f"{get_value(BUSY, 'images_a_second'):.3g} images a second, "
+        f"{get_value(BUSY, worst):.3g} ms at p99.",
     ]
     places = {
         "rows": table.filter(

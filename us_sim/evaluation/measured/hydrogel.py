@@ -2,13 +2,13 @@
 
 Confocal microscopy of fluorescent beads before and after an indentation gives the displacement
 inside a real soft solid. Neither force nor modulus is known, and none is needed: the displacement
-of a box's faces is prescribed, and the nonlinear tissue model says where the beads inside went.
+of a box's faces is prescribed, and the nonlinear tissue model predicts that of the beads inside.
 Parameters are fitted on beads on one side of the indenter's axis and judged on the other side.
 
 The authors of SerialTrack (J. Yang et al., SoftwareX 19, 101204, 2022) linked most beads; where
-the strain is large many are left. Their links deep in the gel, where they are sure, are the seeds;
-from there links grow upwards: an unlinked bead is expected where a local affine fit of its linked
-neighbours puts it, and is linked with the nearest bead there if each is the other's nearest.
+the strain is large many are unlinked. Their sure links, deep in the gel, are the seeds; from there
+links grow upwards: a local affine fit of its linked neighbours predicts the place of an unlinked
+bead, which is linked with the nearest bead there if each is the other's nearest.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ FILE = "results_3D_hardpar.mat"
 
 _MICRON = 1e-6
 _PIXEL = 0.4e-6  # m, of the authors' script
-_SURE, _REACH = 48e-6, 1e-6  # m: height up to which links are the seeds; from the expected place
-_NEIGHBOURS, _LEAST_NEIGHBOURS = 24, 8  # and how many of them must be linked to expect a place
+_SURE, _REACH = 48e-6, 1e-6  # m: height up to which links are seeds; radius around a prediction
+_NEIGHBOURS, _LEAST_NEIGHBOURS = 24, 8  # and how many of them must be linked for a prediction
 _WELL_LINKED = 0.7  # part of a bead's neighbours that must be linked, or its own link may be wrong
 _NEAREST, _NEAREST_AT_FACES = 20, 45  # beads of an affine fit, and of a quadratic one at a face
 _LOWER, _UPPER = 1e-6 * np.array([[45.2, 48.0, 24.0], [365.2, 368.0, 92.0]])  # m, of the box
@@ -61,18 +61,18 @@ _HEIGHTS = (18e-6, 20e-6, 22e-6, 24e-6, 28e-6)  # m, over which the modulus fall
 
 
 def fit_near(places: Array, moved: Array, points: Array, nearest: int, degree: int = 1) -> Array:
-    """(P, 3), the polynomial of the nearest of places (B, 3) by least squares, at each point."""
+    """Evaluate at points (P, 3) least-squares polynomials of the nearest places (B, 3): (P, 3)."""
     return np.asarray(
-        # Beside this smoothing radial functions of micrometres are nothing, and polynomials stay.
+        # Radial functions of micrometres vanish beside this smoothing; polynomials are left.
         RBFInterpolator(places, moved, neighbors=nearest, smoothing=1.0, degree=degree)(points)
     )
 
 
 def read_beads(file: Path) -> tuple[Array, Array]:
-    """Places (B, 3) m and displacement (B, 3) m of well linked beads of the authors' results.
+    """Read places (B, 3) m and displacements (B, 3) m of well linked beads.
 
     Raises:
-        UsSimError: the file cannot be read, or has not two sets of beads and links between them.
+        UsSimError: the file is none of SerialTrack's results, or is damaged.
     """
     try:
         content = loadmat(file)
@@ -90,27 +90,23 @@ def read_beads(file: Path) -> tuple[Array, Array]:
     return before[well], after[partners[well]] - before[well]
 
 
-def grow_links(before: Array, after: Array, links: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(A,) partner of each bead before (A, 3) m among those after (B, 3) m, or -1.
-
-    Args:
-        links: (A,), the seeds.
-    """
-    links, neighbours = links.copy(), _find_neighbours(before)
+def grow_links(before: Array, after: Array, seeds: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Link beads before (A, 3) m with those after (B, 3) m, from seeds (A,): indices or -1."""
+    links, neighbours = seeds.copy(), _find_neighbours(before)
     while True:
         linked = links >= 0
-        asked = np.flatnonzero(~linked & (linked[neighbours].sum(axis=1) >= _LEAST_NEIGHBOURS))
+        ready = np.flatnonzero(~linked & (linked[neighbours].sum(axis=1) >= _LEAST_NEIGHBOURS))
         left = np.setdiff1d(np.arange(len(after)), links[linked])
-        if not len(asked) or not len(left):
+        if not len(ready) or not len(left):
             return links
         moved = after[links[linked]] - before[linked]
-        expected = before[asked] + fit_near(before[linked], moved, before[asked], _NEAREST)
+        expected = before[ready] + fit_near(before[linked], moved, before[ready], _NEAREST)
         distance, found = KDTree(after[left]).query(expected)
         _, back = KDTree(expected).query(after[left])
-        sure = (distance < _REACH) & (back[found] == np.arange(len(asked)))
+        sure = (distance < _REACH) & (back[found] == np.arange(len(ready)))
         if not sure.any():
             return links
-        links[asked[sure]] = left[found[sure]]
+        links[ready[sure]] = left[found[sure]]
 
 
 def _find_neighbours(places: Array) -> NDArray[np.int64]:
@@ -118,10 +114,11 @@ def _find_neighbours(places: Array) -> NDArray[np.int64]:
 
 
 class PrescribedBox:
-    """The box of the live solver's elements, whose faces move as beads near them did.
+    """A box of the live solver's elements, whose faces move like the beads near them.
 
     Args:
-        places, moved: (B, 3) m, of the beads.
+        places: (B, 3) m, of the beads.
+        moved: (B, 3) m, their displacements.
         spacing: m, of the mesh, about.
     """
 
@@ -144,14 +141,14 @@ class PrescribedBox:
         self.harmonic[~self.fixed] = inside.reshape(-1, 3)
 
     def find_equilibrium(self, ratio: float, height: float = np.inf) -> Array:
-        """(N, 3) m, of the live solver's model.
+        """Find the displacement (N, 3) m of the live solver's model.
 
         Args:
             ratio: Poisson's.
             height: m, over which the modulus falls to 1/e along z.
 
         Raises:
-            SolverError: it was not found.
+            SolverError: there is no balance.
         """
         z = self.mesh.nodes[self.mesh.tetrahedra, 2].mean(axis=1)
         materials = make_uniform_materials(self.mesh, Material(1e3, ratio, 1e3))
@@ -170,19 +167,19 @@ class PrescribedBox:
         )
 
     def interpolate_field(self, field: Array, points: Array) -> Array:
-        """(P, 3) m, a nodal field (N, 3) m at points (P, 3) m."""
+        """Interpolate a nodal field (N, 3) m at points (P, 3) m: (P, 3) m."""
         place = locate_points(self.mesh, points)
         corners = field[self.mesh.tetrahedra[place.tetrahedra]]
         return np.asarray(np.einsum("pa,pad->pd", place.weights, corners))
 
 
 def _compute_rms(vectors: Array) -> float:
-    """Root of the mean square, in micrometres."""
+    """Compute the root mean square of vectors (B, 3) m, in micrometres."""
     return float(np.sqrt((vectors**2).sum(axis=1).mean())) / _MICRON
 
 
 def predict_beads(file: Path, spacing: float) -> Iterator[dict[str, Any]]:
-    """Fit on one side of the axis on a coarse mesh; judge on the other on one of a spacing in m."""
+    """Fit on one side of the axis, on a coarse mesh; judge on the other, with ``spacing`` (m)."""
     places, moved = read_beads(file)
     depth = np.minimum(places - _LOWER, _UPPER - places).min(axis=1)
     near, side = abs(depth) < _BAND, places[:, 0] > _AXIS
@@ -223,13 +220,13 @@ def predict_beads(file: Path, spacing: float) -> Iterator[dict[str, Any]]:
 
 
 def plan_hydrogel(folder: Path, quick: bool) -> list[Piece]:
-    """Predict on one mesh; the coarser of the two where it is quick."""
+    """Plan the prediction on one mesh, the coarser one in a quick run."""
     run = partial(predict_beads, folder / FILE, _FITTING_MESH if quick else _MESH)
     return [Piece({"study": "hydrogel"}, run)]
 
 
 def report_hydrogel(rows: pd.DataFrame) -> tuple[str, dict[str, Place]]:
-    """Say how far the beads are off, in all and by height."""
+    """Report the errors of the beads, in all and by height."""
     whole, layers = rows[rows["case"] == "all"], rows[rows["case"] != "all"]
     floor = layers.assign(error=layers["floor"], line="noise").drop_duplicates("x")
     figure = draw_error_over_parameter(

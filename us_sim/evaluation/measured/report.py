@@ -1,4 +1,4 @@
-"""`us-sim evaluate measured`: the simulator beside what others measured."""
+"""`us-sim evaluate measured`: the simulator against measurements of others."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from us_sim.evaluation.settings import MeasuredData
 from us_sim.evaluation.subject import Piece, Place, Report, Subject
 
 COLUMNS = ("case", "quantity", "unit", "measured", "predicted", "error", "floor", "fitted_on")
-"""Of a row, besides ``study``; what is not known is empty."""
+"""Columns besides ``study``; unknown values are empty."""
 
 
 @dataclass(frozen=True)
@@ -28,9 +28,9 @@ class Study:
     """One comparison with data that others measured."""
 
     folder: str  # below the folder of all data; empty where the study needs none
-    plan: Callable[[Path, bool], Sequence[Piece]]  # of that folder, and whether it is a quick run
+    plan: Callable[[Path, bool], Sequence[Piece]]  # of that folder, and True for a quick run
     report: Callable[[pd.DataFrame], tuple[str, Mapping[str, Place]]]
-    """What to take home from the study's rows, and what stands at its places of the page."""
+    """From the study's rows: the line to take home, and the contents of the page's places."""
 
 
 STUDIES = {
@@ -41,10 +41,10 @@ STUDIES = {
 
 
 def plan_pieces(quick: bool, settings: MeasuredData | None = None) -> dict[str, list[Piece]]:
-    """List the work of the studies whose data are there; the page says where the others' are.
+    """List the pieces of the studies whose data are there.
 
     Raises:
-        UsSimError: the folder of all data was named, and is none or has none of them.
+        UsSimError: a folder of all data is named, and has none of them.
     """
     environment = os.environ.get("US_SIM_TEST_DATA")
     data = settings.data if settings and settings.data else environment and Path(environment)
@@ -72,7 +72,7 @@ def _measure(piece: Piece) -> Iterator[dict[str, Any]]:
 
 
 def report_measured(rows: pd.DataFrame) -> Report:
-    """Say what each study found."""
+    """Report the findings of each study."""
     rows = rows.astype(dict.fromkeys(("measured", "predicted", "error", "floor"), float))
     places: dict[str, Place] = {}
     take_home = []

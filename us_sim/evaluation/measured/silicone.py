@@ -1,6 +1,6 @@
-"""Silicone cylinders compressed to two thirds, and what the law of the tissue predicts.
+"""Silicone cylinders compressed by two thirds, against the law of the tissue.
 
-A modulus comes from the compressions below 5 % of the first specimen of a material, and predicts
+A modulus is fitted to the compressions below 5 % of the first specimen of a material. It predicts
 the forces on the second one, by the closed form of a cylinder that slides at its platens.
 """
 
@@ -24,14 +24,14 @@ Array = NDArray[np.float64]
 
 RADIUS, HEIGHT = 0.025, 0.03  # m
 _STEP = 0.01
-COMPRESSIONS = np.arange(0.0, 0.6651, _STEP)  # parts of the height, at which forces are compared
+COMPRESSIONS = np.arange(0.0, 0.6651, _STEP)  # of the height, at which forces are compared
 _FITTED = 0.05  # compression up to which a modulus is fitted
 _COMPARED = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.66)
 _HEADING = "Time (s)"
 
 
 def find_index(compression: float) -> int:
-    """Return the index in `COMPRESSIONS`."""
+    """Return the index of a compression in `COMPRESSIONS`."""
     return round(compression / _STEP)
 
 
@@ -45,17 +45,17 @@ class Silicone:
 
     @property
     def scatter(self) -> Array:
-        """(C,), standard deviation of a test over the mean of all."""
+        """(C,), standard deviation of the tests over their mean."""
         tests = np.concatenate([self.first, self.second])
         mean = tests.mean(axis=0)
         return np.divide(tests.std(axis=0, ddof=1), mean, out=np.zeros_like(mean), where=mean > 0)
 
 
 def read_test(file: Path) -> Array:
-    """(C,) N, forces of a test at `COMPRESSIONS`.
+    """Read the forces (C,) N of a test at `COMPRESSIONS`.
 
     Raises:
-        UsSimError: the file is no such test, or ends before it is pressed that far.
+        UsSimError: the file is no such test, or ends before the last compression.
     """
     lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
     heading = [line.startswith(_HEADING) for line in lines]
@@ -76,10 +76,10 @@ def read_test(file: Path) -> Array:
 
 
 def read_silicones(folder: Path) -> list[Silicone]:
-    """All materials in a folder of folders, by name.
+    """Read all materials in a folder of folders, in the order of their names.
 
     Raises:
-        UsSimError: there is none, or one has no test of a specimen A or B.
+        UsSimError: there is none, or one lacks tests of specimen A or B.
     """
     found = []
     for place in sorted(path for path in folder.glob("*") if path.is_dir()):
@@ -94,23 +94,23 @@ def read_silicones(folder: Path) -> list[Silicone]:
 
 
 def compute_slipping_force(compression: Array) -> Array:
-    """(C,) m2, force over shear modulus of an incompressible cylinder that slides at the platens.
+    """Compute force over shear modulus (C,) m2 of an incompressible cylinder that slides.
 
-    pi R^2 (1 / l^2 - l), with l = 1 - compression.
+    It is pi R^2 (1 / l^2 - l), with l = 1 - compression.
     """
     left = 1.0 - compression
     return np.asarray(math.pi * RADIUS**2 * (left**-2 - left))
 
 
 def fit_modulus(forces: Array) -> float:
-    """Pa, the shear modulus that fits forces (C,) N up to 5 % of compression best."""
+    """Fit the shear modulus (Pa) to forces (C,) N up to 5 % of compression."""
     small = slice(1, find_index(_FITTED) + 1)
     model = compute_slipping_force(COMPRESSIONS[small])
     return float(model @ forces[small] / (model @ model))
 
 
 def predict_silicones(folder: Path) -> Iterator[dict[str, Any]]:
-    """Predict the second specimen's forces from the first one's modulus: medians of errors."""
+    """Predict each second specimen from the first one's modulus; yield median errors."""
     silicones = read_silicones(folder)
     scatter = np.median([silicone.scatter for silicone in silicones], axis=0)
     errors = []
@@ -130,12 +130,12 @@ def predict_silicones(folder: Path) -> Iterator[dict[str, Any]]:
 
 
 def plan_silicone(folder: Path, _: bool) -> list[Piece]:
-    """Predict all; it takes a second."""
+    """Plan the prediction of all materials."""
     return [Piece({"study": "silicone"}, partial(predict_silicones, folder / "data"))]
 
 
 def report_silicone(rows: pd.DataFrame) -> tuple[str, dict[str, Place]]:
-    """Say how far the forces are off, by compression."""
+    """Report the errors of the forces, by compression."""
     predicted = rows.set_index("x")["error"]
     words = (
         f"Silicones: a modulus fitted below 5 % of compression predicts the force to "

@@ -43,15 +43,15 @@ PUBLISHED = {"lying": (20.0, 25.0), "sitting": (50.0, 60.0), "standing": (70.0, 
 """mmHg of a cuff that occludes leg veins (B. Partsch and H. Partsch, Calf compression pressure
 required to achieve venous closure from supine to standing positions, J. Vasc. Surg. 42, 2005)."""
 _CLOSED = 0.2
-"""Part of the area at rest that counts as closed. Below it the mesh holds the vein open, of whose
-tetrahedra most are lumen in part only: see `us_sim.tissue.elasticity.neo_hookean_material`."""
+"""Part of the area at rest that counts as closed. Below it the mesh holds the vein open, since most
+of its tetrahedra are lumen in part only: see `us_sim.tissue.elasticity.neo_hookean_material`."""
 _DEPTH = 22e-3  # m; deeper, the probe would enter the tissue
 MODULI: Mapping[str, Mapping[str, float]] = {
     "of the scene": {},
     "of volunteers": {"skin": 30e3, "fat": 3e3, "muscle": 11e3},
 }
-"""Pa, moduli that take the place of the scene's. Those of volunteers: muscle by shear-wave
-elastography of 127 people (Arda et al., 2011), fat and skin by aspiration in vivo."""
+"""Pa, moduli in place of the scene's. Those of volunteers: muscle by shear-wave elastography of 127
+people (Arda et al., 2011), fat and skin by aspiration in vivo."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class ClosingCurve:
     pressure: Array  # (K,) mmHg, force over the area that the probe touches
 
     def find_pressure(self, area: float) -> float:
-        """Find the pressure where the area first falls to this; NaN where it does not."""
+        """Find the pressure (mmHg) at which the area first falls to this; NaN if it never does."""
         below = np.flatnonzero(self.area <= area)
         if not len(below):
             return float("nan")
@@ -75,7 +75,7 @@ def press_vein(
 ) -> ClosingCurve:
     """Press the arm's probe in ``count`` equal steps on the vein with ``venous`` mmHg in it.
 
-    ``moduli`` (Pa) take the place of Young's moduli of the scene.
+    ``moduli`` (Pa) replace Young's moduli of the scene, by layer.
     """
     scene = load_scene("upper_arm")
     volume = load_volume(scene)
@@ -97,14 +97,14 @@ def press_vein(
         for _ in range(5):
             made = solver.deform(pose)
         lumen = scanner.render_labels(pose, made.nodes) == label
-        touched = _touched_area(model, made.nodes, made.contact_nodes)
+        touched = _compute_touched_area(model, made.nodes, made.contact_nodes)
         rows.append((lumen.sum(), np.linalg.norm(made.force) / touched if touched else 0.0))
     area, pressure = np.array(rows, np.float64).T
     return ClosingCurve(area / area[0], pressure / MMHG)
 
 
-def _touched_area(model: TissueModel, nodes: Array, touched: NDArray[np.integer]) -> float:
-    """m², a third of the surface's triangles for each corner that is touched."""
+def _compute_touched_area(model: TissueModel, nodes: Array, touched: NDArray[np.integer]) -> float:
+    """Compute the touched area (m²): a third of a triangle for each touched corner."""
     surface = model.mesh.boundary
     surface = surface[np.isin(surface, model.contact_nodes).all(axis=1)]
     a, b, c = (nodes[surface[:, k]] for k in range(3))
@@ -132,7 +132,7 @@ def measure_closing(posture: str, moduli: str, count: int) -> Iterator[dict[str,
 
 
 def plan_vein(_: Path, quick: bool) -> list[Piece]:
-    """Each posture with each set of moduli; no data are needed."""
+    """Plan each posture with each set of moduli; no data are needed."""
     count = 22 if quick else 44
     return [
         Piece({"study": "vein"}, partial(measure_closing, posture, moduli, count))
@@ -141,7 +141,7 @@ def plan_vein(_: Path, quick: bool) -> list[Piece]:
 
 
 def report_vein(rows: pd.DataFrame) -> tuple[str, dict[str, Place]]:
-    """Say at which pressures the vein closes, and draw how."""
+    """Report the pressures at which the vein closes, and draw the curves."""
     points = pd.DataFrame(
         [
             {"panel": row.panel, "line": row.line, "pressure": pressure, "area": area}
@@ -158,9 +158,9 @@ def report_vein(rows: pd.DataFrame) -> tuple[str, dict[str, Place]]:
         limits={"y:closed": 100 * _CLOSED},
     )
     scene = rows[rows["panel"] == "moduli of the scene"]
-    said = [f"{row.line} {row.predicted:.0f} ({row.measured:.3g})" for row in scene.itertuples()]
+    found = [f"{row.line} {row.predicted:.0f} ({row.measured:.3g})" for row in scene.itertuples()]
     words = (
-        f"A vein closes under the probe at {', '.join(said)} mmHg; in brackets the pressure of a "
+        f"A vein closes under the probe at {', '.join(found)} mmHg; in brackets the pressure of a "
         f"cuff that was published."
     )
     columns = ["case", "measured", "predicted", "error"]

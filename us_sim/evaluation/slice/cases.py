@@ -1,7 +1,7 @@
-"""Images that `us-sim evaluate slice` cuts of a block of speckle.
+"""Images of a block of speckle for `us-sim evaluate slice`.
 
->>> from us_sim.evaluation.slice.cases import MAIN, block, dent_nodes
->>> len(block(MAIN.counts).nodes), float(dent_nodes(np.zeros((1, 3)), 0.012)[0, 2])
+>>> from us_sim.evaluation.slice.cases import MAIN, make_block_mesh, dent_nodes
+>>> len(make_block_mesh(MAIN.counts).nodes), float(dent_nodes(np.zeros((1, 3)), 0.012)[0, 2])
 (8192, 0.012)
 """
 
@@ -35,12 +35,12 @@ _WIDTH = 0.022  # m, standard deviation of the dent
 
 
 class PlaneView(NamedTuple):
-    """Where the image lies and how it is turned, seen from where the probe stands."""
+    """Place and rotation of an image, relative to the probe."""
 
     words: str
     turned: float = 0.0  # degrees about the probe's axis
-    tilted: float = 0.0  # degrees about the image's columns' direction, first
-    beside: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, from where the probe stands
+    tilted: float = 0.0  # degrees about x, before the turn
+    beside: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, from the probe
 
 
 PLANES = {
@@ -64,15 +64,15 @@ class SliceFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class SliceCase:
-    """An image of the block: how large, on which mesh, how deformed, and on which plane."""
+    """An image of the block: its size, mesh, deformation and plane."""
 
-    size: int
-    counts: tuple[int, int, int]
-    deformation: str
-    plane: str
+    size: int  # pixels, of columns and rows
+    counts: tuple[int, int, int]  # nodes of the mesh along x, y and z
+    deformation: str  # of `DEPTHS`
+    plane: str  # of `PLANES`
 
     def make_frames(self, count: int) -> list[SliceFrame]:
-        """Images of a trembling probe, so that none repeats the one before."""
+        """Make frames of a trembling probe, so that none repeats the one before."""
         rest = make_block_mesh(self.counts).nodes
         depth, view = DEPTHS[self.deformation], PLANES[self.plane]
         found = []
@@ -91,13 +91,12 @@ class SliceCase:
         return found
 
 
-MAIN = SliceCase(
-    512, MESHES[-1], "pressed_12mm", "straight"
-)  # the case by which methods are compared
+MAIN = SliceCase(512, MESHES[-1], "pressed_12mm", "straight")
+"""The case by which methods are compared."""
 
 
 def list_cases(quick: bool) -> list[SliceCase]:
-    """All that are cut, the main one first; the quick run leaves most of them out."""
+    """List the cases, the main one first; the quick run leaves most of them out."""
     if quick:
         return [
             MAIN,
@@ -119,10 +118,10 @@ def list_cases(quick: bool) -> list[SliceCase]:
 
 
 def dent_nodes(nodes: Array, depth: float) -> Array:
-    """Nodes (N, 3) m of the block pressed by ``depth`` m in the middle of its top.
+    """Press nodes (N, 3) m of the block by ``depth`` (m) in the middle of its top.
 
-    A smooth field, so that nothing depends on a solver: down under a Gaussian dent that ends at
-    the bottom, and aside halfway down.
+    The field is smooth, and needs no solver: down under a Gaussian dent that ends at the bottom,
+    and aside halfway down.
     """
     height = EXTENT[2][1]
     below = nodes[:, 2:] / height
@@ -133,7 +132,7 @@ def dent_nodes(nodes: Array, depth: float) -> Array:
 
 @cache
 def make_speckle() -> Volume:
-    """The block's volume, and a little around it: speckle with bright layers."""
+    """Make the volume of the block and 5 mm around it: speckle with bright layers."""
     axes = [
         low - _BEYOND + _VOXEL * (np.arange(math.ceil((high - low + 2 * _BEYOND) / _VOXEL)) + 0.5)
         for low, high in EXTENT

@@ -1,7 +1,7 @@
-"""Every slicing method cuts the same images, in turns; each is compared with `per_pixel`.
+"""Errors and run times of every slicing method, on the same images, in turns.
 
-That one tries every tetrahedron for every pixel, in float64. What it finds is held against linear
-algebra and SciPy in the tests.
+The reference is `per_pixel`, which tries every tetrahedron for every pixel, in float64. The tests
+compare it with linear algebra and SciPy.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from us_sim.volume.volume import Volume
 Array = NDArray[np.float64]
 
 OURS = "scan_conversion"
-"""The method that the others are compared with, and that the targets are about."""
+"""The method of the targets."""
 
 REFERENCE = "per_pixel"
-WRONG = 0.1  # voxels at rest, beyond which a pixel shows other tissue
+WRONG = 0.1  # voxels at rest, above which a pixel shows other tissue
 
 SLICING_METHODS = ((OURS, 1), (OURS, 2), (REFERENCE, 1))
-"""Methods and their numbers of threads, in the report's order; VTK is the last, where it is."""
+"""Methods and their numbers of threads, in the report's order; VTK, if installed, is the last."""
 
 
 def measure_case(case: SliceCase, seconds: float) -> list[dict[str, Any]]:
-    """A row for every method, timed together for so many seconds."""
+    """Measure a row for every method; time them together for some seconds."""
     volume, mesh, frames = make_speckle(), make_block_mesh(case.counts), case.make_frames(4)
     first = frames[0]
-    reference = create_slicer(REFERENCE, volume, mesh.nodes, mesh.tetrahedra)
+    tissue = volume, mesh.nodes, mesh.tetrahedra
+    reference = create_slicer(REFERENCE, *tissue)
     exact = reference.cut_image(*first), reference.compute_rest_coordinates(*first)
-    where = volume, mesh.nodes, mesh.tetrahedra
     slicers: list[tuple[str, int, Slicer | VtkSlicer]] = [
-        (name, threads, create_slicer(name, *where, threads=threads))
+        (name, threads, create_slicer(name, *tissue, threads=threads))
         for name, threads in SLICING_METHODS
     ]
     if importlib.util.find_spec("vtkmodules") is not None:
-        slicers.append(("vtk", 1, VtkSlicer(*where)))
+        slicers.append(("vtk", 1, VtkSlicer(*tissue)))
     rows: list[dict[str, Any]] = []
     for method, threads, slicer in slicers:
         image, rest = slicer.cut_image(*first), slicer.compute_rest_coordinates(*first)
@@ -58,22 +58,22 @@ def measure_case(case: SliceCase, seconds: float) -> list[dict[str, Any]]:
 def time_slicers(
     slicers: Sequence[Slicer | VtkSlicer], frames: Sequence[SliceFrame], seconds: float
 ) -> list[dict[str, float]]:
-    """Times of all slicers, by column, in turns on a noisy machine.
+    """Time all slicers in turns, on a noisy machine; return a row of columns for each.
 
     Args:
-        slicers: to be timed; each has cut an image before, so that nothing is compiled now.
-        frames: that they cut, over and over, five in a turn where one takes less than 8 ms.
-        seconds: after which no further turn begins, if each has had three; methods slower than 150
-            ms sit those out.
+        slicers: compiled; each has cut an image before.
+        frames: to cut, over and over, five in a turn, or one if it takes over 8 ms.
+        seconds: after which no turn begins but the first three, in which slicers over 150 ms have
+            only one.
     """
-    walls: list[list[float]] = [[] for _ in slicers]  # ms
-    owns: list[list[float]] = [[] for _ in slicers]  # ms of the processor
+    wall_times: list[list[float]] = [[] for _ in slicers]  # ms
+    cpu_times: list[list[float]] = [[] for _ in slicers]  # ms
     begin = time.perf_counter()
     for turn in itertools.count():
         late = time.perf_counter() - begin > seconds
         if turn >= 3 and late:
             break
-        for slicer, wall, own in zip(slicers, walls, owns, strict=True):
+        for slicer, wall, cpu in zip(slicers, wall_times, cpu_times, strict=True):
             if turn and late and min(wall) > 150.0:
                 continue
             for image in range(5):
@@ -81,17 +81,17 @@ def time_slicers(
                 before, worked = time.perf_counter(), time.process_time()
                 slicer.cut_image(*frame)
                 wall.append(1e3 * (time.perf_counter() - before))
-                own.append(1e3 * (time.process_time() - worked))
+                cpu.append(1e3 * (time.process_time() - worked))
                 if min(wall) > 8.0:
                     break
     return [
         {
             "ms_median": float(np.median(wall)),
             "ms_p99": float(np.percentile(wall, 99)),
-            "cpu_ms_median": float(np.median(own)),
+            "cpu_ms_median": float(np.median(cpu)),
             "images": len(wall),
         }
-        for wall, own in zip(walls, owns, strict=True)
+        for wall, cpu in zip(wall_times, cpu_times, strict=True)
     ]
 
 
@@ -103,7 +103,7 @@ def compare_images(
     rest: Array,
     tissue_only: bool = False,
 ) -> dict[str, Any]:
-    """Errors, by column, of an image (rows, columns) and of its places at rest.
+    """Compute the errors, by column, of an image (rows, columns) and its places at rest.
 
     Args:
         volume: that was cut.
@@ -111,8 +111,8 @@ def compare_images(
         exact: the reference's image and places.
         image: grey values.
         rest: (rows, columns, 3) m, places at rest; NaN where the method found nothing.
-        tissue_only: the method, as VTK, knows nothing of the rigid volume outside the mesh: what it
-            finds is compared, and what it does not find is missed where tissue has moved.
+        tissue_only: the method, as VTK, does not show the rigid volume outside the mesh: only
+            pixels that it shows are compared; others are missed only where tissue has moved.
     """
     grey, places = exact
     known, seen = np.isfinite(places[..., 0]), np.isfinite(rest[..., 0])
@@ -131,17 +131,17 @@ def compare_images(
 
 
 def _measure_voxels(volume: Volume, way: Array) -> Array:
-    """(rows, columns) voxels along ways (rows, columns, 3) m."""
+    """Measure vectors (rows, columns, 3) m in voxels: (rows, columns)."""
     return np.asarray(np.linalg.norm(way @ volume.patient_to_index[:3, :3].T, axis=-1))
 
 
 class VtkSlicer:
-    """Cuts images with VTK, as a user of VTK would, to compare with.
+    """A slicer of VTK's filters, for comparison.
 
-    `vtkProbeFilter` finds the pixels in the deformed mesh, whose nodes carry their coordinates at
-    rest, and interpolates those; a second one samples the volume there. The mesh is passed to it in
-    columns, rows and heights over the image, since it ignores an image's direction matrix; that is
-    also its fast method, which goes through the cells instead of searching one for each pixel.
+    `vtkProbeFilter` finds the pixels in the deformed mesh and interpolates its nodes' coordinates
+    at rest; a second one samples the volume there. The mesh is passed in columns, rows and heights
+    over the image, since the filter ignores an image's direction matrix; for an image it is also
+    fast, since it goes through the cells instead of searching one for each pixel.
 
     Args:
         volume: in frame ``patient``.
@@ -200,26 +200,26 @@ class VtkSlicer:
         self._sampler.SetSourceData(self._voxels)
 
     def cut_image(self, nodes: Array, plane: SlicePlane) -> NDArray[np.uint8]:
-        """(rows, columns): the grey values of tissue, 0 elsewhere."""
-        self._find(nodes, plane)
+        """Cut the grey values (rows, columns) of tissue, 0 elsewhere."""
+        self._locate_pixels(nodes, plane)
         self._at.SetData(self._finder.GetOutput().GetPointData().GetArray("rest"))
         self._at.Modified()
         self._sampler.Update()
         grey = self._sampler.GetOutput().GetPointData().GetArray("grey")
         image = self._to_numpy(grey).reshape(plane.rows, plane.columns)
-        return np.where(self._valid(plane), image, np.uint8(0))
+        return np.where(self._make_mask(plane), image, np.uint8(0))
 
     def compute_rest_coordinates(self, nodes: Array, plane: SlicePlane) -> Array:
-        """(rows, columns, 3) m, where each pixel's tissue lies at rest; NaN elsewhere."""
-        self._find(nodes, plane)
+        """Compute each pixel's place (rows, columns, 3) m at rest; NaN outside tissue."""
+        self._locate_pixels(nodes, plane)
         index = self._to_numpy(self._finder.GetOutput().GetPointData().GetArray("rest"))
         to_patient = np.linalg.inv(self._to_index)
         rest = index[:, ::-1] @ to_patient[:3, :3].T + to_patient[:3, 3]
         rest = rest.reshape(plane.rows, plane.columns, 3)
-        rest[~self._valid(plane)] = np.nan
+        rest[~self._make_mask(plane)] = np.nan
         return np.asarray(rest)
 
-    def _find(self, nodes: Array, plane: SlicePlane) -> None:
+    def _locate_pixels(self, nodes: Array, plane: SlicePlane) -> None:
         np.add(nodes @ plane.to_pixel[:, :3].T, plane.to_pixel[:, 3], out=self._placed)
         self._points.GetData().Modified()
         self._points.Modified()
@@ -228,7 +228,7 @@ class VtkSlicer:
         self._pixels.Modified()
         self._finder.Update()
 
-    def _valid(self, plane: SlicePlane) -> NDArray[np.bool_]:
-        """(rows, columns): which pixels of the latest image lie in the mesh."""
+    def _make_mask(self, plane: SlicePlane) -> NDArray[np.bool_]:
+        """Return a mask (rows, columns) of the latest image's pixels in the mesh."""
         mask = self._finder.GetOutput().GetPointData().GetArray("vtkValidPointMask")
         return np.asarray(self._to_numpy(mask).reshape(plane.rows, plane.columns) > 0)

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from us_sim.evaluation.figures import draw_error_over_time, draw_lines
+from us_sim.evaluation.figures import PlotOptions, draw_error_over_time, draw_lines
 from us_sim.evaluation.report import fit_exponent
 from us_sim.evaluation.slice.cases import MAIN, PLANES, list_cases
 from us_sim.evaluation.slice.measure import OURS, measure_case
@@ -39,8 +39,8 @@ def _report(table: pd.DataFrame) -> Report:
     image = table[(table["deformation"] == MAIN.deformation) & (table["plane"] == MAIN.plane)]
     meshes, sizes = image[image["size"] == MAIN.size], image[image["nodes"] == nodes]
     main = meshes[meshes["nodes"] == nodes]
-    own = table[table["method"] == OURS]
-    single = own[own["threads"] == 1]
+    ours = table[table["method"] == OURS]
+    single = ours[ours["threads"] == 1]
     one = main[main["threads"] == 1].set_index("method")[["ms_median", "cpu_ms_median"]]
     # The lesser of the ratios of wall clock and of processor time.
     faster = float((one.loc["vtk"] / one.loc[OURS]).min()) if "vtk" in one.index else np.nan
@@ -59,7 +59,7 @@ def _report(table: pd.DataFrame) -> Report:
         Target.at_most(f"{what}, two cores", 1.2, wall.get(2, np.nan), "ms"),
         Target.at_least("times as fast as VTK (filter and sampling)", 20, faster),
         Target.at_most(f"pixels of {pixels:,} with a wrong coverage", 0, wrong),
-        Target.at_most("grey levels that a pixel is off", 1, own["max_grey_difference"].max()),
+        Target.at_most("grey levels that a pixel is off", 1, ours["max_grey_difference"].max()),
         Target.at_most("time on 65,536 nodes over that on 2,000", 1.5, growth),
         Target.at_most("k in time ~ pixels^k", 1, power),
     ]
@@ -92,11 +92,16 @@ def _report(table: pd.DataFrame) -> Report:
             "count",
             "cpu_ms_median",
             "Time against pixels and nodes, pressed by 12 mm",
-            panels="across",
-            lines="method",
-            log="xy",
-            limits={"y:16.7 ms: 60 images a second": 1000.0 / 60.0},
-            labels={"count": "", "cpu_ms_median": "processor time of an image, ms (one thread)"},
+            PlotOptions(
+                panels="across",
+                lines="method",
+                log="xy",
+                limits={"y:16.7 ms: 60 images a second": 1000.0 / 60.0},
+                labels={
+                    "count": "",
+                    "cpu_ms_median": "processor time of an image, ms (one thread)",
+                },
+            ),
         ),
         "planes": "; ".join(f"`{name}`: {view.words}" for name, view in PLANES.items()),
     }
@@ -104,7 +109,7 @@ def _report(table: pd.DataFrame) -> Report:
         f"An image of {what} takes {wall.get(1, np.nan):.2g} ms of one core, {faster:.3g} times "
         f"less than VTK's filters.",
         f"Every pixel shows the right tissue: {wrong} of {pixels:,} have a wrong coverage, and the "
-        f"worst is {own['max_voxel_error'].max():.1g} voxels off its true place.",
+        f"worst is {ours['max_voxel_error'].max():.1g} voxels off its true place.",
         f"From 2,000 to 65,536 nodes the time grows {growth:.2g} times; with the pixels as their "
         f"power {power:g}.",
     ]

@@ -1,6 +1,7 @@
 """Stiff and extreme cases for tissue solvers: small meshes, materials, supports and motions.
 
->>> from us_sim.evaluation.stability.cases import sample_held_cases, make_mesh, make_poses, sample_cases
+>>> from us_sim.evaluation.stability.cases import make_mesh, make_poses
+>>> from us_sim.evaluation.stability.cases import sample_cases, sample_held_cases
 >>> cases = sample_cases(64)
 >>> len(cases), cases == sample_cases(64), len(make_mesh("box").nodes)
 (64, True, 64)
@@ -42,9 +43,9 @@ COLLIDERS: dict[str, Collider] = {
     "plate": RoundedBox(0.05, 0.02, 0.03, 0.002),
     "pebble": RoundedBox(0.06, 0.05, 0.05, 0.025),
 }
-"""Colliders by name, for a tissue 0.1 m wide; they are as much larger or smaller as others are."""
+"""Colliders by name, for a tissue 0.1 m wide; for others they are scaled."""
 
-LAYOUTS = ("inclusion", "skin", "half", "scattered")  # where a mesh is stiffer by the contrast
+LAYOUTS = ("inclusion", "skin", "half", "scattered")  # parts of a mesh, stiffer by the contrast
 
 MOTIONS = ("press", "jump", "through", "tremor", "slide", "tilt", "scribble", "flicker")
 """Motions of the probe, see `make_poses`."""
@@ -57,11 +58,11 @@ class StabilityCase:
     case: str
     young_modulus: float = 1e4  # Pa, of the softest tetrahedron
     contrast: float = 1.0  # of the stiffest to the softest modulus
-    layout: str = "inclusion"  # where it is stiff, see `LAYOUTS`
+    layout: str = "inclusion"  # stiff part, of `LAYOUTS`
     poisson_ratio: float = 0.45
     density: float = 1000.0  # kg/m3
     time_step: float = 0.01  # s, of methods that have one
-    damping: float = 1.0  # times the time in which a wave crosses an edge, likewise
+    damping: float = 1.0  # times the time in which a wave crosses an edge, of these methods
     depth: float = 0.25  # of the tissue's thickness
     motion: str = "press"
     mesh: str = "box"
@@ -69,14 +70,14 @@ class StabilityCase:
     collider: str = "sphere"
     release: str = "removed"  # the probe is "removed" or "lifted"
     stabilisation: str = "mass_scaling"  # of explicit methods
-    held: int = 0  # frames that the probe stays where its motion ended, before its release
+    held: int = 0  # frames for which the probe stays at the end of its motion
 
 
 def sample_cases(count: int) -> list[StabilityCase]:
-    """``count`` (a power of two) cases spread evenly over all ranges: a Sobol sequence's first.
+    """Sample ``count`` (a power of two) cases evenly over all ranges, by a Sobol sequence.
 
-    Those of young_modulus, contrast, density, time_step and damping (but for an eighth without any)
-    are even in the logarithm, those of poisson_ratio in lg(0.5 - poisson_ratio).
+    Modulus, contrast, density, time step and damping (but for an eighth without any) are even in
+    the logarithm, Poisson's ratio in that of 0.5 - ratio.
     """
     points = qmc.Sobol(13, scramble=False).random_base2(round(math.log2(count)))
     return [_sample_case(number, point) for number, point in enumerate(points)]
@@ -108,7 +109,7 @@ def _sample_case(number: int, point: NDArray[np.float64]) -> StabilityCase:
 
 
 def list_extreme_cases() -> list[StabilityCase]:
-    """Cases with a name: one extreme at a time."""
+    """List cases with a name: one extreme at a time."""
     cases = [
         StabilityCase("soft as 1 Pa", young_modulus=1.0),
         StabilityCase("stiff as 1 TPa", young_modulus=1e12),
@@ -146,7 +147,7 @@ def list_extreme_cases() -> list[StabilityCase]:
 
 
 def make_model(case: StabilityCase) -> TissueModel:
-    """The tissue of a case, through the same checks as any other."""
+    """Make the tissue of a case, with the same checks as any other."""
     mesh = make_mesh(case.mesh)
     count = len(mesh.tetrahedra)
     modulus = np.full(count, case.young_modulus)
@@ -162,7 +163,7 @@ def make_model(case: StabilityCase) -> TissueModel:
 
 
 def _scale_collider(collider: Collider, scale: float) -> Collider:
-    """The collider so many times as large, also beyond the sizes that settings allow a probe."""
+    """Scale a collider, even beyond the sizes that settings allow."""
     scaled = copy.copy(collider)
     for name, size in asdict(collider).items():
         object.__setattr__(scaled, name, scale * size)
@@ -170,7 +171,7 @@ def _scale_collider(collider: Collider, scale: float) -> Collider:
 
 
 def _find_stiff(mesh: TetrahedralMesh, layout: str) -> NDArray[np.bool_]:
-    """(M,) which tetrahedra are the stiff ones."""
+    """Find the stiff tetrahedra (M,)."""
     middle = mesh.nodes[mesh.tetrahedra].mean(axis=1)
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     place = (middle - low) / (high - low)
@@ -185,12 +186,12 @@ def _find_stiff(mesh: TetrahedralMesh, layout: str) -> NDArray[np.bool_]:
 
 @lru_cache
 def make_mesh(name: str) -> TetrahedralMesh:
-    """One of `MESHES`, made once: its top is z = 0 and its bottom the largest z."""
+    """Make one of `MESHES`, once: its top is z = 0, its bottom the largest z."""
     return MESHES[name]()
 
 
 def find_fixed_nodes(mesh: TetrahedralMesh, support: str) -> NDArray[np.bool_]:
-    """(N,) which nodes are held: the "bottom", also the "walls", or "three" of the bottom."""
+    """Find the fixed nodes (N,): the "bottom", also the "walls", or "three" of the bottom."""
     nodes = mesh.nodes
     fixed = np.zeros(len(nodes), dtype=bool)
     bottom = face_nodes(mesh, "bottom")
@@ -210,7 +211,7 @@ def _make_box(nx: int, ny: int, nz: int, size: float = 1.0) -> TetrahedralMesh:
 
 
 def _jitter_mesh(mesh: TetrahedralMesh, spread: float, seed: int) -> TetrahedralMesh:
-    """Every node that is not on a face moved at random; those on faces within their face."""
+    """Move every node at random; those on a face within their face."""
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     moved = mesh.nodes + spread * np.random.default_rng(seed).uniform(-1, 1, mesh.nodes.shape)
     on_face = (mesh.nodes == low) | (mesh.nodes == high)
@@ -218,7 +219,7 @@ def _jitter_mesh(mesh: TetrahedralMesh, spread: float, seed: int) -> Tetrahedral
 
 
 def _make_delaunay() -> TetrahedralMesh:
-    """Of scattered points, with the slivers that come of that."""
+    """Make a mesh of scattered points, with slivers."""
     points = _jitter_mesh(_make_box(5, 5, 5), 0.0003, seed=5).nodes
     corners = Delaunay(points).simplices
     a, b, c, d = np.moveaxis(points[corners], 1, 0)
@@ -246,12 +247,12 @@ MESHES: dict[str, Callable[[], TetrahedralMesh]] = {
 """The tissues by name."""
 
 
-HOLD = 30  # frames in which the probe stays where its motion ended
-SMALL = 1e-3  # residual that must be reached by then
+HOLD = 30  # frames for which the probe stays at the end of its motion
+SMALL = 1e-3  # residual to be reached by then
 
 
 def sample_held_cases(count: int, seed: int) -> list[StabilityCase]:
-    """So many random cases within anatomy, in which a held probe must come to balance.
+    """Sample random cases within anatomy, in which tissue under a held probe must balance.
 
     Moduli are 1 to 100 kPa (the softest), contrasts up to 1000, Poisson's ratios 0.3 to 0.495,
     depths 5 to 50 % of the thickness; modulus, contrast and 0.5 minus Poisson's ratio are even in
@@ -288,13 +289,13 @@ LIFTED = Pose(position=np.array([0.0, 0.0, -100.0]))  # far from any tissue
 
 
 def make_poses(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | None]:
-    """The probe's pose in every frame until it is released.
+    """Make the probe's pose in every frame until its release; None while there is no probe.
 
     Args:
-        motion: one of `us_sim.evaluation.stability.cases.MOTIONS`.
-        mesh: whose top is z = 0. The probe is put above the node of the top that is nearest to the
-            middle, so that a needle hits one.
-        depth: reached, as a fraction of the mesh's thickness.
+        motion: one of `MOTIONS`.
+        mesh: its top is z = 0. The probe is above the node nearest to the middle of the top, so
+            that a needle hits one.
+        depth: to reach, as a fraction of the mesh's thickness.
     """
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     wide, breadth, thick = high - low
@@ -304,7 +305,7 @@ def make_poses(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | 
     about = np.array([0.4, 1.0, 0.1]) / np.linalg.norm([0.4, 1.0, 0.1])
 
     def place_probe(z: float, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> Pose:
-        """Put it z m deep, x and y widths aside, turned by an angle."""
+        """Place the probe z (m) deep, x and y widths aside, turned by an angle (rad)."""
         turn = np.append(np.sin(angle / 2) * about, np.cos(angle / 2))
         return Pose(np.array([nearest[0] + x * wide, nearest[1] + y * wide, z]), turn)
 

@@ -1,4 +1,4 @@
-"""One solver on one extreme case: finite, bounded, back at rest after release, and truthful?
+"""One solver on one extreme case: is it finite, bounded, truthful, and at rest after release?
 
 >>> from us_sim.evaluation.stability.cases import StabilityCase
 >>> from us_sim.evaluation.stability.measure import try_case
@@ -35,26 +35,26 @@ from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
 @dataclass(eq=False)
 class Trial:
-    """Result of a case."""
+    """Result of a solver in a case."""
 
     finite: bool = True
     bounded: bool = True
     truthful: bool = True
     refusal: str = ""  # the sentence with which the method refused the case
-    failure: str = ""  # why it counts as failed though the four above are fine
-    recovered_mm: float = math.nan  # farthest node from rest, in the end
-    recovery_frames: int | None = None  # until it was near rest; None when it never was
+    failure: str = ""  # a fault besides those above
+    recovered_mm: float = math.nan  # farthest node from rest, at the end
+    recovery_frames: int | None = None  # until it is near rest; None if it never is
     residual_reported: float = math.nan  # in the last frame with a probe, or the first untrue one
     residual_checked: float = math.nan  # in the same frame
     held: list[float] = field(default_factory=list)  # residuals since the probe stopped
     held_inverted: int = 0  # tetrahedra, at the end of the hold
     slowest_ms: float = 0.0
-    kept: int = 0  # frames that failed, so that the solver kept its last good state or rest
-    actions: list[tuple[str, ...]] = field(default_factory=list)  # that frames reported, each once
+    kept: int = 0  # failed frames, in which the solver kept its last good state or rest
+    actions: list[tuple[str, ...]] = field(default_factory=list)  # reported by frames, each once
 
     @property
     def fault(self) -> str:
-        """The first thing that went wrong; empty where nothing did."""
+        """The first fault; empty without one."""
         if self.failure or (self.finite and self.bounded and self.truthful):
             return self.failure
         if not (self.finite and self.bounded):
@@ -64,14 +64,14 @@ class Trial:
 
     @property
     def frames_to_balance(self) -> int | None:
-        """Frames of the hold until the residual stays small; None where it never does."""
+        """Frames of the hold until the residual stays small; None if it never does."""
         large = [number for number, residual in enumerate(self.held) if not residual <= SMALL]
         after = large[-1] + 1 if large else 0
         return after if after < len(self.held) else None
 
 
 def try_case(method: str, case: StabilityCase) -> Trial:
-    """Make the solver and run the case; a refusal in one sentence is a result, too."""
+    """Make the solver and run the case; a refusal in one sentence is also a result."""
     trial = Trial()
     is_dynamic = TISSUE_METHODS[method].is_dynamic
     try:
@@ -82,7 +82,7 @@ def try_case(method: str, case: StabilityCase) -> Trial:
         if not (is_dynamic and case.stabilisation == "substeps"):  # it may need too many
             trial.failure = "was refused, and has nothing to be refused for"
         return trial
-    except Exception as error:  # whatever it is, a user would see a traceback
+    except Exception as error:  # a user would see a traceback
         trial.failure = f"raised {type(error).__name__} while it was made: {error}"
         return trial
     run_trial(solver, TISSUE_METHODS[method].equations(model), case, trial)
@@ -90,30 +90,19 @@ def try_case(method: str, case: StabilityCase) -> Trial:
 
 
 def run_trial(solver: TissueSolver, forces: Forces, case: StabilityCase, trial: Trial) -> None:
-    """Move the probe as the case says, release, and note the solver's results."""
+    """Move the probe as in the case, release it, and record the solver's results."""
     model = solver.model
     poses = make_poses(case.motion, model.mesh, case.depth)
     bound = _compute_bound(model, poses)
     moving = len(poses)
     poses = [*poses, *poses[-1:] * case.held]
-    thickness = float(np.ptp(model.mesh.nodes[:, 2]))
     released = None if case.release == "removed" else LIFTED
     frames = 150 if TISSUE_METHODS[solver.name].is_dynamic else 40  # after the release
     last: Deformation | None = None
-    stuck, heaviest = 0, 0.0
+    stuck, load = 0, 0.0
     for number, pose in enumerate([*poses, *[released] * frames]):
-        start = time.perf_counter()
-        try:
-            deformation = solver.deform(pose)
-        except Exception as error:  # a frame must never raise
-            trial.finite = False
-            trial.failure = f"raised {type(error).__name__} in frame {number}: {error}"
-            return
-        trial.slowest_ms = max(trial.slowest_ms, 1e3 * (time.perf_counter() - start))
-        if deformation.actions and deformation.actions not in trial.actions:
-            trial.actions.append(deformation.actions)
-        if not _is_finite(deformation):
-            trial.finite = False
+        deformation = _run_frame(solver, pose, number, trial)
+        if deformation is None:
             return
         if case.held and moving <= number + 1 <= len(poses):
             trial.held.append(float(deformation.residual))
@@ -121,29 +110,15 @@ def run_trial(solver: TissueSolver, forces: Forces, case: StabilityCase, trial: 
             trial.held_inverted = int((volumes <= 0).sum())
         failed = Intervention.FRAME_FAILED in deformation.interventions
         if failed:
-            trial.kept += 1
-            if Intervention.KEPT_STATE in deformation.interventions and last is not None:
-                same = np.array_equal(deformation.nodes, last.nodes)
-                if not same or deformation.residual != last.residual:
-                    trial.failure = "said that it kept the last good state, and returned another"
+            _check_kept_state(deformation, last, trial)
         away = float(np.linalg.norm(deformation.nodes - model.mesh.nodes, axis=1).max())
         trial.bounded = trial.bounded and away <= bound
-        free = number - len(poses)
-        if free < 0 and not failed and not model.fixed[deformation.contact_nodes].all():
-            unbalanced, rounding, load = bound_imbalance(model, forces, deformation)
-            heaviest = max(heaviest, load)
-            if heaviest > 0.0 and trial.truthful:  # to which it refers where less is pushed
-                reported, checked = float(deformation.residual), unbalanced / heaviest
-                trial.truthful = is_residual_true(reported, checked, rounding / heaviest)
-                trial.residual_reported, trial.residual_checked = reported, checked
-        if free >= 0:
-            trial.recovered_mm = 1e3 * away
-            if away > 1e-4 * thickness:
-                trial.recovery_frames = None
-            elif trial.recovery_frames is None:
-                trial.recovery_frames = free + 1
+        if number >= len(poses):
+            _record_recovery(model, away, number - len(poses), trial)
             if deformation is last:
                 break  # settled
+        elif not failed:
+            load = _check_residual(model, forces, deformation, load, trial)
         last = deformation
         stuck = stuck + 1 if failed else 0
     if stuck >= frames:
@@ -152,8 +127,63 @@ def run_trial(solver: TissueSolver, forces: Forces, case: StabilityCase, trial: 
         trial.failure = _describe_imbalance(trial, case)
 
 
+def _run_frame(
+    solver: TissueSolver, pose: Pose | None, number: int, trial: Trial
+) -> Deformation | None:
+    """Run one frame; return None if the solver raised, or if its numbers are not finite."""
+    start = time.perf_counter()
+    try:
+        deformation = solver.deform(pose)
+    except Exception as error:  # a frame must never raise
+        trial.finite = False
+        trial.failure = f"raised {type(error).__name__} in frame {number}: {error}"
+        return None
+    trial.slowest_ms = max(trial.slowest_ms, 1e3 * (time.perf_counter() - start))
+    if deformation.actions and deformation.actions not in trial.actions:
+        trial.actions.append(deformation.actions)
+    numbers = (deformation.nodes, deformation.force, deformation.torque, deformation.residual)
+    trial.finite = all(bool(np.isfinite(number).all()) for number in numbers)
+    return deformation if trial.finite else None
+
+
+def _check_kept_state(deformation: Deformation, last: Deformation | None, trial: Trial) -> None:
+    """Count a failed frame, whose kept state must be that of the last frame."""
+    trial.kept += 1
+    if Intervention.KEPT_STATE in deformation.interventions and last is not None:
+        same = np.array_equal(deformation.nodes, last.nodes)
+        if not same or deformation.residual != last.residual:
+            trial.failure = "said that it kept the last good state, and returned another"
+
+
+def _record_recovery(model: TissueModel, away: float, number: int, trial: Trial) -> None:
+    """Record the distance from rest (m) in a frame after the release."""
+    trial.recovered_mm = 1e3 * away
+    if away > 1e-4 * float(np.ptp(model.mesh.nodes[:, 2])):
+        trial.recovery_frames = None
+    elif trial.recovery_frames is None:
+        trial.recovery_frames = number + 1
+
+
+def _check_residual(
+    model: TissueModel, forces: Forces, deformation: Deformation, load: float, trial: Trial
+) -> float:
+    """Check the residual under the probe; return the greatest load (N) of the frames so far.
+
+    The residual refers to that load, also in frames with less.
+    """
+    if model.fixed[deformation.contact_nodes].all():
+        return load
+    unbalanced, rounding, own_load = bound_imbalance(model, forces, deformation)
+    load = max(load, own_load)
+    if load > 0.0 and trial.truthful:
+        reported, checked = float(deformation.residual), unbalanced / load
+        trial.truthful = is_residual_true(reported, checked, rounding / load)
+        trial.residual_reported, trial.residual_checked = reported, checked
+    return load
+
+
 def _describe_imbalance(trial: Trial, case: StabilityCase) -> str:
-    """Fault under the held probe; empty where the tissue is in balance and not inverted."""
+    """Describe the fault under a held probe; empty if tissue is in balance and not inverted."""
     if trial.frames_to_balance is None:
         return f"held for {case.held} frames it was left with a residual of {trial.held[-1]:.3g}"
     if trial.held_inverted:
@@ -162,15 +192,15 @@ def _describe_imbalance(trial: Trial, case: StabilityCase) -> str:
 
 
 def is_residual_true(reported: float, checked: float, rounding: float) -> bool:
-    """Whether a reported residual is true: at least half of the least that it can be.
+    """Return True if a reported residual is at least half of ``checked``, its lower bound.
 
-    Negligible ones are true: below 1e-5, or below the ``rounding`` of nodes to doubles.
+    Negligible bounds make it true: below 1e-5, or below the ``rounding`` of nodes to doubles.
     """
     return math.isfinite(checked) and checked <= max(1e-5, rounding, 2.0 * reported)
 
 
 def _make_settings(case: StabilityCase) -> dict[str, Any]:
-    """Settings of a method with masses; critical damping is that of one edge's springs, about."""
+    """Make settings of a method with masses; damping 1 is about critical for one edge."""
     mesh = make_mesh(case.mesh)
     nodes, edges = mesh.nodes, mesh.edges
     edge = float(np.linalg.norm(nodes[edges[:, 1]] - nodes[edges[:, 0]], axis=1).mean())
@@ -182,13 +212,8 @@ def _make_settings(case: StabilityCase) -> dict[str, Any]:
     }
 
 
-def _is_finite(deformation: Deformation) -> bool:
-    numbers = (deformation.nodes, deformation.force, deformation.torque, deformation.residual)
-    return all(bool(np.isfinite(number).all()) for number in numbers)
-
-
 def _compute_bound(model: TissueModel, poses: list[Pose | None]) -> float:
-    """m, three times as far as any node can be pushed."""
+    """Compute the bound (m) of displacements: three times as far as a node can be pushed."""
     nodes, box = model.mesh.nodes, model.collider.offset_box
     pressing = (pose for pose in poses if pose is not None and pose is not LIFTED)
     reach = max(float(np.linalg.norm(pose.position)) for pose in pressing)

@@ -1,4 +1,4 @@
-"""`us-sim evaluate stability`: try to break every tissue solver, and report how it fared."""
+"""`us-sim evaluate stability`: try to break every tissue solver, and report its faults."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from us_sim.tissue.solvers.solver import create_solver
 
 
 def plan_pieces(quick: bool) -> dict[str, list[Piece]]:
-    """Every case for every method; the cases are the same in every run."""
+    """Plan every case for every method; the cases are the same in every run."""
     cases = [*list_extreme_cases(), *sample_cases(32 if quick else 1024)]
     cases += sample_held_cases(24 if quick else 500, 1)
     return {"stability": plan_cases(cases)}
 
 
 def plan_cases(cases: Sequence[StabilityCase]) -> list[Piece]:
-    """These cases for every method."""
+    """Plan these cases for every method."""
     bench = StabilityBench()
     pieces = []
     for name, method in TISSUE_METHODS.items():
@@ -48,31 +48,31 @@ def plan_cases(cases: Sequence[StabilityCase]) -> list[Piece]:
 
 
 class StabilityBench:
-    """Runs cases, with what solvers precompute in a folder of its own that is deleted."""
+    """A bench that runs cases, with the solvers' cache in a temporary folder."""
 
     def __init__(self) -> None:
         self._cache = tempfile.TemporaryDirectory(prefix="us-sim-stability-")
         self._warm: set[str] = set()
 
     def run_case(self, method: str, case: StabilityCase) -> Iterator[dict[str, Any]]:
-        """Run a case."""
+        """Run a case, and yield its row."""
         cache = {"US_SIM_CACHE": self._cache.name}
         with threadpool_limits(1), patch.dict(os.environ, cache):
-            if method not in self._warm:  # so that no frame's time contains a compilation
+            if method not in self._warm:  # so that no frame has to compile
                 create_solver(method, make_model(StabilityCase("box"))).warm_up()
                 self._warm.add(method)
             trial = try_case(method, case)
         ran = {} if trial.refusal else asdict(trial)
         fault = trial.fault
-        said = [f"FAILED: {fault}"] if fault else []
-        said += [f"refused: {trial.refusal}"] if trial.refusal else []
+        remarks = [f"FAILED: {fault}"] if fault else []
+        remarks += [f"refused: {trial.refusal}"] if trial.refusal else []
         yield {
             "recovery_frames": ran.get("recovery_frames"),
             "frames_to_1e-3": trial.frames_to_balance if trial.held else None,
             "held_residual": trial.held[-1] if trial.held else None,
             "held_inverted": bool(trial.held_inverted) if trial.held else None,
             **{name: ran.get(name) for name in _RAN},
-            "action": " | ".join([*said, *map("; ".join, trial.actions[:3])]),
+            "action": " | ".join([*remarks, *map("; ".join, trial.actions[:3])]),
             "failure": fault,
             "refused": bool(trial.refusal),
             "kept": trial.kept,
@@ -85,7 +85,7 @@ _RAN = ("finite", "bounded", "recovered_mm", "residual_reported", "residual_chec
 
 
 def report_stability(rows: pd.DataFrame) -> Report:
-    """Count what went wrong, and show the residuals over what makes a case hard."""
+    """Count the faults, and draw residuals and recovery over what makes a case hard."""
     failed = int((rows["failure"] != "").sum())
     held = rows[rows["held_residual"].notna()]
     take_home = [
@@ -93,12 +93,12 @@ def report_stability(rows: pd.DataFrame) -> Report:
         f"residual was not true, that was refused for no reason, or left out of balance."
     ]
     for name, method in TISSUE_METHODS.items():
-        mine = held[held["method"] == name]
-        if len(mine):
-            balanced = 100 * mine["frames_to_1e-3"].notna().mean()
-            inverted = int(mine["held_inverted"].sum())
+        own = held[held["method"] == name]
+        if len(own):
+            balanced = 100 * own["frames_to_1e-3"].notna().mean()
+            inverted = int(own["held_inverted"].sum())
             take_home.append(
-                f"`{name}`: in {balanced:.1f} % of {len(mine)} cases within anatomy balanced to "
+                f"`{name}`: in {balanced:.1f} % of {len(own)} cases within anatomy balanced to "
                 f"0.001 under a held probe, in {inverted} with tetrahedra inside out"
                 f"{' (which would count as failed)' if method.is_judged_at_rest else ''}."
             )
@@ -125,21 +125,21 @@ def report_stability(rows: pd.DataFrame) -> Report:
 
 
 def _count_faults(rows: pd.DataFrame) -> pd.DataFrame:
-    """How each method fared, in all cases."""
+    """Count the faults of each method in all cases."""
     counts = []
-    for name, mine in rows.groupby("method", sort=False):
-        ran = mine[~mine["refused"]]
+    for name, own in rows.groupby("method", sort=False):
+        ran = own[~own["refused"]]
         counts.append(
             {
                 "method": name,
-                "cases": len(mine),
-                "refused": int(mine["refused"].sum()),
-                "failed": int((mine["failure"] != "").sum()),
+                "cases": len(own),
+                "refused": int(own["refused"].sum()),
+                "failed": int((own["failure"] != "").sum()),
                 **{f"not {word}": int((ran[word] == False).sum()) for word in _LAWS},  # noqa: E712
                 "back to rest, %": 100 * ran["recovery_frames"].notna().mean(),
                 "frames, median": ran["recovery_frames"].astype(float).median(),
-                "kept": int(mine["kept"].sum()),
-                "slowest ms": mine["slowest_ms"].max(),
+                "kept": int(own["kept"].sum()),
+                "slowest ms": own["slowest_ms"].max(),
             }
         )
     return pd.DataFrame(counts)

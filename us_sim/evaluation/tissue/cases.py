@@ -1,4 +1,4 @@
-"""The presses of `us-sim evaluate tissue`, all of the block of tissue, held at its bottom.
+"""The presses of `us-sim evaluate tissue`; the block of tissue is held at its bottom.
 
 >>> from us_sim.evaluation.block import MESHES
 >>> from us_sim.evaluation.tissue.cases import SCENES
@@ -33,22 +33,22 @@ _AROUND = (-0.03, 0.03, 0.03)  # m, touched by a sphere that is pressed straight
 
 @dataclass(frozen=True)
 class BlockScene:
-    """A probe's path into the block; results are compared at its end."""
+    """A path of the probe into the block; results are compared at its end."""
 
     name: str
     words: str
     collider: Collider
     path: tuple[Pose, ...]  # one a frame
-    touched: tuple[float, float, float]  # m: x from, x to, y to; where the reference is fine
+    touched: tuple[float, float, float]  # m: x from, x to, y to, of the reference's fine mesh
     poisson_ratio: float = 0.45
 
     @property
     def material(self) -> Material:
-        """Soft tissue."""
+        """The material of the block, soft tissue."""
         return Material(10e3, self.poisson_ratio, 1000.0)
 
     def make_model(self, counts: tuple[int, int, int]) -> TissueModel:
-        """The block on a uniform mesh of so many nodes along each axis."""
+        """Make the block on a uniform mesh with ``counts`` nodes along x, y and z."""
         mesh = make_block_mesh(counts)
         fixed = np.zeros(len(mesh.nodes), dtype=bool)
         fixed[face_nodes(mesh, "bottom")] = True
@@ -56,7 +56,7 @@ class BlockScene:
         return TissueModel(mesh, materials, fixed, self.collider, face_nodes(mesh, "top"))
 
     def make_reference_planes(self, size: float) -> tuple[NDArray[np.float64], ...]:
-        """Planes (m) of the reference's half block, ``size`` apart where the probe touches."""
+        """Place planes (m) of the reference's half block, ``size`` apart under the probe."""
         low, high, beside = self.touched
         return (
             make_graded_planes(*EXTENT[0], low, high, size, 1.2),

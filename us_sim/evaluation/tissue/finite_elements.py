@@ -32,7 +32,7 @@ _BATCH = 128  # elements whose stiffness is computed at once, which bounds the m
 
 _OWN, _LINEAR = 5.0, 45.0
 """Parts of lambda + mu over mu: `own` is all up to Poisson's ratio 0.4, `linear` the rest up to
-0.49. What is beyond is `own` again, for without it Newton's method finds no way at 0.4999."""
+0.49. The part above that is `own` again; without it Newton's method does not converge at 0.4999."""
 
 
 class NeoHookeanHexahedra:
@@ -46,8 +46,8 @@ class NeoHookeanHexahedra:
     where p is the linear function in an element that is nearest to J - 1 in the mean square (the
     27/4 element of T. Sussman and K.-J. Bathe, A finite element formulation for nonlinear
     incompressible elastic and inelastic analysis, Comput. Struct. 26, 1987). With J - 1 alone large
-    elements are too stiff however far from the probe they lie: at Poisson's ratio 0.49
-    displacements came out 3 % wrong. Meshes, shape functions and quadrature are scikit-fem's; its
+    elements are too stiff even far from the probe: at Poisson's ratio 0.49 displacements were 3 %
+    wrong. Meshes, shape functions and quadrature are scikit-fem's; its
     loop over pairs of shape functions takes 23 times as long for a stiffness (125 elements).
 
     Args:
@@ -89,7 +89,7 @@ class NeoHookeanHexahedra:
         self.surface_values = self._evaluate_basis(basis, self.surface_points)
 
     def compute_energy(self, displacement: Array) -> float:
-        """J, stored at a displacement (N, 3); infinite where something is inside out."""
+        """Compute the energy (J) at a displacement (N, 3) m; infinite if an element is inverted."""
         gradient = self._compute_deformation_gradient(displacement)
         ratio = np.linalg.det(gradient)
         if not ratio.min() > 0.0:
@@ -101,7 +101,7 @@ class NeoHookeanHexahedra:
         return float((self._weights * density).sum())
 
     def compute_forces(self, displacement: Array) -> Array:
-        """(N, 3) N, derivative of the energy."""
+        """Compute forces (N, 3) N, the derivative of the energy."""
         gradient = self._compute_deformation_gradient(displacement)
         pressure, cofactor = self._compute_pressure(gradient)
         stress = self._shear * gradient + pressure[..., None, None] * cofactor
@@ -116,7 +116,7 @@ class NeoHookeanHexahedra:
         )
 
     def assemble_stiffness(self, displacement: Array) -> bsr_array:
-        """(3N, 3N) N/m, second derivative of the energy, in 3x3 blocks; nothing inside out."""
+        """Assemble the energy's second derivative (3N, 3N) N/m; no element may be inverted."""
         gradient = self._compute_deformation_gradient(displacement)
         batches = [slice(k, k + _BATCH) for k in range(0, len(gradient), _BATCH)]
         local = np.concatenate(
@@ -132,16 +132,16 @@ class NeoHookeanHexahedra:
         return bsr_array((blocks, entries[0].indices, entries[0].indptr))
 
     def compute_volume(self, displacement: Array) -> float:
-        """m3, of the deformed box."""
+        """Compute the volume (m3) of the deformed box."""
         ratio = np.linalg.det(self._compute_deformation_gradient(displacement))
         return float((self._weights * ratio).sum())
 
     def interpolate_field(self, field: Array, points: Array) -> Array:
-        """(P, D), a nodal field (N, D) interpolated at rest positions (P, 3) m in the box."""
+        """Interpolate a nodal field (N, D) at rest positions (P, 3) m in the box: (P, D)."""
         return np.asarray(self._evaluate_basis(self._basis, points) @ field)
 
     def _evaluate_basis(self, basis: Basis, points: Array) -> csr_array:
-        """(P, N), values of a basis' shape functions at points (P, 3) m in the box."""
+        """Evaluate a basis' shape functions at points (P, 3) m in the box: (P, N)."""
         cells = tuple(
             np.clip(np.searchsorted(p, x, side="right") - 1, 0, len(p) - 2)
             for p, x in zip(self.planes, points.T, strict=True)
@@ -156,12 +156,12 @@ class NeoHookeanHexahedra:
         return found
 
     def _compute_deformation_gradient(self, displacement: Array) -> Array:
-        """(M, Q, 3, 3)."""
+        """Compute the deformation gradient (M, Q, 3, 3) at the quadrature points."""
         local = displacement[self.elements][:, None]  # (M, 1, 27, 3)
         return (self._gradients @ local).swapaxes(2, 3) + np.eye(3)
 
     def _compute_local_stiffness(self, gradient: Array, batch: slice) -> Array:
-        """(B, 729, 9) N/m of each pair of nodes, of a batch of elements.
+        """Compute the stiffness (B, 729, 9) N/m of each pair of nodes of a batch of elements.
 
         The cofactor's derivative is (cof_ij cof_kl - cof_il cof_kj) / J.
         """
@@ -182,7 +182,7 @@ class NeoHookeanHexahedra:
         return local.swapaxes(2, 3).reshape(count, 729, 9)
 
     def _compute_pressure(self, gradient: Array) -> tuple[Array, Array]:
-        """(M, Q) Pa, the factor of the cofactor in the stress, and the cofactor (M, Q, 3, 3)."""
+        """Return the cofactor's factor (M, Q) Pa in the stress, and the cofactor (M, Q, 3, 3)."""
         rows = [np.cross(gradient[..., i - 2, :], gradient[..., i - 1, :]) for i in range(3)]
         swelling = np.linalg.det(gradient) - 1.0
         linear = self._linear * (swelling @ self._projection.T)
@@ -190,12 +190,12 @@ class NeoHookeanHexahedra:
 
 
 def _sum_products(vectors: Array, weights: Array) -> Array:
-    """(B, K, K), of vectors (B, Q, K) of each batch the weighted sum of products of all pairs."""
+    """Sum weighted products of all pairs of components of vectors (B, Q, K): (B, K, K)."""
     return (vectors * weights[..., None]).swapaxes(1, 2) @ vectors
 
 
 def _make_linear_projection(points: Array, weights: Array) -> Array:
-    """(Q, Q), from values at quadrature points (3, Q) of a box to the nearest linear function's."""
+    """Make the (Q, Q) map from values at points (3, Q) to the nearest linear function's."""
     linear = np.vstack([np.ones(points.shape[1]), points]).T  # (Q, 4)
     weighted = linear * weights[:, None]
     return linear @ np.linalg.solve(linear.T @ weighted, weighted.T)

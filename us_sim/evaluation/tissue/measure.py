@@ -1,6 +1,6 @@
-"""Every method follows a probe's path at its own pace, and is compared at the path's end.
+"""Error and run time of every method along a probe's path.
 
-Its nodes are compared with large deformation on fine quadratic elements
+The nodes at the path's end are compared with large deformation on fine quadratic elements
 (`us_sim.evaluation.tissue.reference`).
 
 >>> import numpy as np
@@ -40,7 +40,7 @@ _SIZES, _QUICK_SIZES = (0.01, 0.0065, 0.005), (0.01, 0.0065)  # m, of the refere
 
 @dataclass(frozen=True, eq=False)
 class PathOutcome:
-    """The end of a path by a method, or by a reference at the same nodes."""
+    """Result of a method at the end of a path, or of the reference at the same nodes."""
 
     displacement: NDArray[np.float64]  # (N, 3) m
     force: float  # N, on the probe along its axis
@@ -48,7 +48,7 @@ class PathOutcome:
 
     @classmethod
     def from_deformation(cls, model: TissueModel, deformation: Deformation) -> PathOutcome:
-        """The outcome of a solver."""
+        """Return the outcome of a solver."""
         return cls(
             deformation.nodes - model.mesh.nodes,
             float(deformation.force[2]),
@@ -59,7 +59,7 @@ class PathOutcome:
 def compare_outcomes(
     found: PathOutcome, exact: PathOutcome, rest_volume: float
 ) -> dict[str, float]:
-    """Errors of ``found``, by column; all but ``max_error_mm`` are relative."""
+    """Compute the errors of ``found``, by column; all but ``max_error_mm`` are relative."""
     difference = found.displacement - exact.displacement
     return {
         "rel_l2_error": float(np.linalg.norm(difference) / np.linalg.norm(exact.displacement)),
@@ -70,10 +70,10 @@ def compare_outcomes(
 
 
 def plan_pieces(quick: bool) -> dict[str, list[Piece]]:
-    """List everything that is run, in order: the references, and then the methods.
+    """List the pieces in order: the references, and then the methods.
 
-    The main press takes every mesh, the others the paper's finest. All settings are tried on that,
-    and in the main press on the coarsest; elsewhere each method's defaults.
+    The main press runs on every mesh, the others on the paper's finest. There, and in the main
+    press on the coarsest mesh, all settings are run; elsewhere each method's defaults.
     """
     bench = TissueBench()
     references, trials = [], []
@@ -108,27 +108,27 @@ def _describe_trial(
 
 
 class TissueBench:
-    """Keeps the model, and what its trials are compared with."""
+    """A bench that runs the pieces; it keeps the last model, and all references."""
 
     def __init__(self) -> None:
         self._references: dict[str, ContactSolution] = {}
         self._models: dict[Any, TissueModel] = {}
-        self._exact: dict[Any, PathOutcome] = {}  # of the last model
+        self._exact: dict[Any, PathOutcome] = {}  # the reference at its nodes
         self._warm: set[str] = set()
 
     def measure_reference(
         self, scene: BlockScene, sizes: tuple[float, ...]
     ) -> Iterator[dict[str, Any]]:
-        """Find the nonlinear reference of a scene, and how far it has converged."""
+        """Solve the nonlinear reference of a scene, and measure its convergence."""
         *_, coarse, fine = solve_reference(scene, sizes)
         self._references[scene.name] = fine
         points = fine.block.corners
-        here, there = fine.interpolate_displacement(points), coarse.interpolate_displacement(points)
+        last, before = (each.interpolate_displacement(points) for each in (fine, coarse))
         yield {
             "elements": f"{sizes[-2] * 1e3:g} → {sizes[-1] * 1e3:g} mm",
             "unknowns": fine.displacement.size,
             "force_n": -float(fine.force[2]),
-            "l2_change": float(np.linalg.norm(there - here) / np.linalg.norm(here)),
+            "l2_change": float(np.linalg.norm(before - last) / np.linalg.norm(last)),
             "force_change": float(
                 np.linalg.norm(coarse.force - fine.force) / np.linalg.norm(fine.force)
             ),
@@ -138,7 +138,7 @@ class TissueBench:
     def run_method(
         self, scene: BlockScene, counts: tuple[int, int, int], method: str, setting: Setting
     ) -> Iterator[dict[str, Any]]:
-        """Time a method, and compare it with the reference."""
+        """Run a method along the path, time it, and compare it with the reference."""
         if (scene.name, counts) not in self._models:
             self._models = {(scene.name, counts): scene.make_model(counts)}
             self._exact = {
@@ -162,19 +162,18 @@ class TissueBench:
         }
 
     def _find_exact(self, scene: BlockScene, nodes: NDArray[np.float64]) -> PathOutcome:
-        """The reference at nodes (N, 3) m."""
+        """Return the reference at nodes (N, 3) m."""
         if scene.name not in self._references:
             raise SolverError(f"the reference of {scene.name} was not found")
-        there = self._references[scene.name]
-        return PathOutcome(
-            there.interpolate_displacement(nodes), float(there.force[2]), there.volume
-        )
+        exact = self._references[scene.name]
+        displacement = exact.interpolate_displacement(nodes)
+        return PathOutcome(displacement, float(exact.force[2]), exact.volume)
 
 
 def _time_path(solver: TissueSolver, scene: BlockScene) -> tuple[list[float], Deformation]:
-    """ms of every frame of the path, followed three times from rest or for 20 s, and the last.
+    """Follow the path three times from rest, or for 20 s; return ms of every frame, and the last.
 
-    The first pass warms caches and does not count, if there is another.
+    The first pass warms caches; it counts only if there is no other.
     """
     frames: list[float] = []
     begin = time.perf_counter()

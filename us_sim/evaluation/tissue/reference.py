@@ -36,7 +36,7 @@ from us_sim.tissue.elasticity.material import Material
 Array = NDArray[np.float64]
 
 _SOFT = 200.0
-"""Penalty, Pa/m over Young's modulus, of the first poses: a soft contact is found in few steps."""
+"""Penalty (1/m, over Young's modulus) of the first poses: a soft contact converges quickly."""
 _HARDER = (200.0, 200.0, 1000.0, 5000.0, 20000.0)
 """Penalties at the last pose; a hard contact is exact. The multipliers are updated each time."""
 _AUGMENTATIONS = 4
@@ -46,8 +46,7 @@ _APPROACHING = 1e-2  # the same at the poses before
 _NEWTON_STEPS = 60
 _SHORTEST_STEP = 2.0**-12
 _STIFFENED = (0.0, 1e-3, 1e-2, 0.1, 1.0)
-"""Parts of the tangent's diagonal that are added to it, until it is definite (K. Levenberg, 1944).
-"""
+"""Parts of the diagonal that are added to the tangent until it is definite (K. Levenberg, 1944)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +61,7 @@ class ContactSolution:
     penetration: float  # m, the deepest point of the surface inside the probe
 
     def interpolate_displacement(self, points: Array) -> Array:
-        """(P, 3) m, displacement of rest positions (P, 3) m anywhere in the block."""
+        """Interpolate the displacement (P, 3) m of rest positions (P, 3) m in the whole block."""
         side = np.where(points[:, 1:2] < 0, -1.0, 1.0) * [[0, 1, 0]] + [[1, 0, 1]]
         return self.block.interpolate_field(self.displacement, points * side) * side
 
@@ -74,7 +73,7 @@ def solve_contact(
     poses: Sequence[Pose],
     start: ContactSolution | None = None,
 ) -> ContactSolution:
-    """Approach the last pose through the others.
+    """Find the equilibrium under the last pose; approach it through the others.
 
     Args:
         planes: m, of x, y >= 0 and z; the block is held at the last of z.
@@ -121,7 +120,7 @@ def solve_contact(
 
 
 class _Search:
-    """Newton's method on one block; keeps the displacement and the contact multipliers."""
+    """Newton's method on a block, with its displacement and contact multipliers."""
 
     def __init__(self, block: NeoHookeanHexahedra, collider: Collider) -> None:
         self.block, self.collider = block, collider
@@ -136,16 +135,16 @@ class _Search:
         self._prolongation = (self._mask @ spread).tocsr()[:, coarse]
 
     def compute_pressure(self, pose: Pose) -> tuple[Array, Array, Array]:
-        """At the surface points: Pa (S,), the direction of the push (S, 3), curvature (S, 3, 3)."""
+        """Compute pressure (S,) Pa, its direction (S, 3) and curvature (S, 3, 3) at the surface."""
         gap, normal, curvature = self._measure_gaps(pose)
         return np.maximum(self.push - self.penalty * gap, 0.0), normal, curvature
 
     def compute_penetration(self, pose: Pose) -> float:
-        """m, how deep the deepest surface point is inside the probe."""
+        """Compute the depth (m) of the deepest surface point inside the probe."""
         return max(0.0, -float(self._measure_gaps(pose)[0].min()))
 
     def equilibrate(self, pose: Pose, tolerance: float) -> None:
-        """Move to where the unbalanced force is below ``tolerance`` times the contact force."""
+        """Iterate until the unbalanced force is below ``tolerance`` times the contact force."""
         energy = self._compute_energy(pose)
         for _ in range(_NEWTON_STEPS):
             unbalanced, load = self._compute_imbalance(pose)
@@ -171,7 +170,7 @@ class _Search:
         )
 
     def _compute_step(self, pose: Pose, unbalanced: Array) -> Array:
-        """(N, 3) m, of Newton's method; with a stiffer tangent where that is not definite."""
+        """Compute Newton's step (N, 3) m; stiffen the tangent if it is not definite."""
         tangent, right = self._assemble_tangent(pose), -unbalanced.ravel()
         for part in _STIFFENED:
             stiffer = bsr_array(_make_diagonal(part * tangent.diagonal()), blocksize=(3, 3))
@@ -186,7 +185,7 @@ class _Search:
         return self.block.compute_energy(self.displacement) + float(contact)
 
     def _compute_imbalance(self, pose: Pose) -> tuple[Array, float]:
-        """Forces (N, 3) N that nothing balances, and the norm of the contact forces."""
+        """Compute the unbalanced forces (N, 3) N, and the norm of the contact forces."""
         pressure, normal, _ = self.compute_pressure(pose)
         weighted = (self.block.surface_weights * pressure)[:, None] * normal
         pushes = self.block.surface_values.T @ weighted
@@ -204,7 +203,7 @@ class _Search:
         return (self._mask @ matrix @ self._mask + held).tobsr((3, 3))
 
     def _measure_gaps(self, pose: Pose) -> tuple[Array, Array, Array]:
-        """Gap (S,) m of the surface points to the probe, its gradient and its second derivative."""
+        """Measure gaps (S,) m from surface points to the probe, with both derivatives."""
         points = self.block.surface_points + self.block.surface_values @ self.displacement
         *half, rounding = self.collider.offset_box
         rotation = pose.rotation
@@ -215,15 +214,15 @@ class _Search:
         normal = np.sign(local) * outside / distance[:, None]
         curved = (beyond > 0).astype(float)[:, :, None] * np.eye(3)
         curvature = (curved - normal[:, :, None] * normal[:, None, :]) / distance[:, None, None]
-        return (distance - rounding, normal @ rotation.T, rotation @ curvature @ rotation.T)
+        return distance - rounding, normal @ rotation.T, rotation @ curvature @ rotation.T
 
 
 def _solve_system(matrix: bsr_array, right: Array, prolongation: csr_array) -> Array:
-    """(3N,) about the solution of a symmetric system, by conjugate gradients.
+    """Solve a symmetric system approximately, by conjugate gradients: (3N,).
 
-    They are preconditioned by the inverse of the diagonal's blocks and by the same mesh with linear
-    elements, to whose nodes ``prolongation`` (3N, 3C) leads. Where the matrix is not definite, the
-    step may ascend.
+    The preconditioner is the inverse of the diagonal's blocks, and the same mesh with linear
+    elements, from whose nodes ``prolongation`` (3N, 3C) interpolates. If the matrix is not
+    definite, the step may ascend.
     """
     rows = np.repeat(np.arange(len(matrix.indptr) - 1), np.diff(matrix.indptr))
     smooth = _make_block_diagonal(np.linalg.inv(matrix.data[rows == matrix.indices]))
@@ -238,16 +237,14 @@ def _solve_system(matrix: bsr_array, right: Array, prolongation: csr_array) -> A
         corrected = prolongation @ coarse.solve(prolongation.T @ residual)
         return np.asarray(corrected + smooth @ residual)
 
-    goal, both = (
-        1e-3 * float(np.linalg.norm(right)),
-        LinearOperator(matrix.shape, apply_preconditioner),
-    )
-    found, _ = cg(matrix, right, atol=goal, maxiter=400, M=both)
+    tolerance = 1e-3 * float(np.linalg.norm(right))
+    preconditioner = LinearOperator(matrix.shape, apply_preconditioner)
+    found, _ = cg(matrix, right, atol=tolerance, maxiter=400, M=preconditioner)
     return np.asarray(found)
 
 
 def _make_block_diagonal(blocks: Array) -> bsr_array:
-    """(3B, 3B) of blocks (B, 3, 3)."""
+    """Make a block diagonal matrix (3B, 3B) of blocks (B, 3, 3)."""
     return bsr_array((blocks, np.arange(len(blocks)), np.arange(len(blocks) + 1)))
 
 
@@ -256,7 +253,7 @@ def _make_diagonal(entries: NDArray[np.floating]) -> dia_array:
 
 
 def _find_movable(block: NeoHookeanHexahedra, points: Array) -> NDArray[np.bool_]:
-    """(P, 3): all but the bottom, and not out of the mirror plane."""
+    """Find the components (P, 3) that may move: not the bottom's, nor out of the mirror plane."""
     free = np.ones(points.shape, dtype=bool)
     free[np.isclose(points[:, 1], block.planes[1][0]), 1] = False
     free[np.isclose(points[:, 2], block.planes[2][-1])] = False
@@ -267,7 +264,7 @@ def solve_reference(scene: BlockScene, sizes: Sequence[float]) -> list[ContactSo
     """Solve the end of a scene's path on finer and finer meshes.
 
     Args:
-        scene: pressed as its path's end says.
+        scene: its path is followed to the end.
         sizes: m, of the elements under the probe; each mesh starts from the one before.
 
     Raises:

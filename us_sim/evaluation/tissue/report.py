@@ -25,7 +25,7 @@ _LABELS = {
 
 
 def report_tissue(references: pd.DataFrame, points: pd.DataFrame) -> Report:
-    """Say what the methods cost and how far they are off."""
+    """Report the methods' errors and run times."""
     points = points.assign(
         line=points["method"] + points["setting"].map({"stiffness=fitted": ", fitted"}).fillna(""),
         default=points["setting"] == "default",
@@ -56,14 +56,14 @@ def _list_take_home(main: pd.DataFrame, fronts: dict[str, pd.DataFrame]) -> Iter
 
 
 def _find_pareto_front(points: pd.DataFrame) -> pd.DataFrame:
-    """Points than which no other is both faster and more accurate, fastest first."""
+    """Find the points than which no other is faster and more accurate, fastest first."""
     ordered = points.sort_values(["ms_median", "rel_l2_error"])
     best = ordered["rel_l2_error"].cummin().shift(fill_value=np.inf)
     return ordered[ordered["rel_l2_error"] < best]
 
 
 def _draw_errors(points: pd.DataFrame, panels: str, words: str) -> Figure:
-    """Full marks are defaults; a line joins a method's settings that solve the same equations."""
+    """Draw errors over run time; full marks are defaults, a line joins equal equations."""
     looks = {
         line: replace(LOOKS[method], style="-" if line == method else "--")
         for method, line in zip(points["method"], points["line"], strict=True)
@@ -80,7 +80,7 @@ def _draw_errors(points: pd.DataFrame, panels: str, words: str) -> Figure:
 
 
 def _tabulate_errors(points: pd.DataFrame) -> pd.DataFrame:
-    """The rows' main columns, by the names that a reader reads."""
+    """Tabulate the main columns, with names for a reader."""
     table = points[["scene", "method"]].copy()
     table["ms"], table["max mm"] = points["ms_median"], points["max_error_mm"]
     table["L2 %"], table["force %"] = 100 * points["rel_l2_error"], 100 * points["force_error"]
@@ -89,7 +89,7 @@ def _tabulate_errors(points: pd.DataFrame) -> pd.DataFrame:
 
 
 def _tabulate_estimates(defaults: pd.DataFrame) -> pd.DataFrame:
-    """Errors that methods estimate by themselves beside the true ones."""
+    """Tabulate the errors that methods estimate beside the true ones."""
     found = defaults[defaults["estimated_error"].notna()]
     table = found[["scene", "method", "nodes"]].copy()
     table["L2 %"] = 100 * found["rel_l2_error"]

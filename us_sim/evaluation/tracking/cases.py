@@ -1,4 +1,4 @@
-"""Bodies of markers, cameras and conditions that trackers are measured in, and views of them.
+"""Bodies of markers, cameras and conditions in which trackers are measured.
 
 >>> from us_sim.evaluation.tracking.cases import TrackingCase
 >>> case = TrackingCase("aruco_40mm", "640x480", 0.4, 30.0)
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 SMALL, LARGE = WEBCAMS  # images, by their sizes
 RIGID_BODY, SINGLE = "rigid_body_6x30mm", "aruco_40mm"
 FRAMES = 5
-"""Views in a row, as a hand moves the body; before the first, the tracker forgets everything."""
+"""Views in a row, as a hand moves the body; a new tracker begins each sequence."""
 
 _RATE = 30.0  # frames per second
 _SPEED, _TURNING = 0.05, 0.2  # m/s and rad/s, of the hand
@@ -52,7 +52,7 @@ CONDITIONS = {
 
 @dataclass(frozen=True, eq=False)
 class Marker:
-    """A body of markers, its words in a report, and how it is made."""
+    """A body of markers, its words in a report, and a function that makes it."""
 
     words: str
     make: Callable[[], RigidBody]
@@ -65,7 +65,7 @@ class Marker:
 
     @cached_property
     def front(self) -> Array:
-        """(3,) unit, of the side that the camera is before at an angle of 0."""
+        """(3,) unit normal of the side that faces the camera at an angle of 0."""
         return self.body.normals[0] if self.facing is None else np.array(self.facing)
 
 
@@ -94,7 +94,7 @@ MARKERS = {
 
 @dataclass(frozen=True)
 class TrackingCase:
-    """A body seen from a distance at an angle, again and again."""
+    """A body at a distance and an angle, in a condition; the rest is random."""
 
     marker: str
     image_size: str
@@ -104,13 +104,13 @@ class TrackingCase:
 
     @property
     def key(self) -> str:
-        """The text that random seeds come from, as of the published tables."""
+        """Text from which random seeds are made, as for the published tables."""
         return repr(self).removeprefix("Tracking")
 
     def make_sequence(self, number: int) -> list[Pose]:
-        """Poses of the body in ``camera_optical``, `FRAMES` of them; the middle one as asked."""
+        """Make `FRAMES` poses of the body in ``camera_optical``; the middle one is the case's."""
         random = np.random.default_rng([zlib.crc32(self.key.encode()), number])
-        camera, seen = WEBCAMS[self.image_size], MARKERS[self.marker]
+        camera, marker = WEBCAMS[self.image_size], MARKERS[self.marker]
         size = np.array([camera.width, camera.height])
         pixel = size * (0.5 + random.uniform(-0.12, 0.12, 2))
         place = np.append(camera.compute_rays(pixel[None])[0], 1.0)
@@ -122,9 +122,9 @@ class TrackingCase:
             _make_turn(_find_rotation(np.array([0.0, 0.0, 1.0]), place))
             @ _make_turn(tilt)
             @ _make_turn(spin)
-            @ _make_turn(_find_rotation(seen.front, np.array([0.0, 0.0, -1.0])))
+            @ _make_turn(_find_rotation(marker.front, np.array([0.0, 0.0, -1.0])))
         )
-        middle = seen.body.centres.mean(axis=0)
+        middle = marker.body.centres.mean(axis=0)
         asked = Pose(place - turn.rotation @ middle, turn.orientation)
         velocity = self.compute_velocity(number)
         poses = []
@@ -137,7 +137,7 @@ class TrackingCase:
         return poses
 
     def compute_velocity(self, number: int) -> Array:
-        """(6,) m/s and rad/s, of a sequence's middle, along the camera's axes."""
+        """Compute the velocity (6,) m/s and rad/s in a sequence, along the camera's axes."""
         random = np.random.default_rng([zlib.crc32(self.key.encode()), number, 1])
         directions = random.normal(size=(2, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -145,12 +145,12 @@ class TrackingCase:
         return haste * np.concatenate([_SPEED * directions[0], _TURNING * directions[1]])
 
     def compute_motion(self, number: int) -> Array | None:
-        """(6,) from the beginning to the end of the exposure; None where it is too short."""
+        """Compute the motion (6,) m and rad during the exposure; None if that is short."""
         return _EXPOSURE * self.compute_velocity(number) if self.condition == "blur" else None
 
 
 def list_cases(quick: bool) -> list[TrackingCase]:
-    """All that is measured, in order."""
+    """List the cases in the order of the report."""
     distances = (0.4, 0.9) if quick else (0.2, 0.3, 0.4, 0.6, 0.9, 1.3)
     angles = (0.0, 30.0, 60.0) if quick else (0.0, 15.0, 30.0, 45.0, 60.0, 70.0)
     tilted = (30.0,) if quick else (0.0, 30.0, 60.0)
@@ -175,7 +175,7 @@ def _make_turn(vector: Array) -> Pose:
 
 
 def _find_rotation(one: Array, other: Array) -> Array:
-    """(3,) rad, of the shortest rotation from one direction to another."""
+    """Find the shortest rotation (3,) rad from one direction to another."""
     one, other = one / np.linalg.norm(one), other / np.linalg.norm(other)
     axis = np.cross(one, other)
     sine = float(np.linalg.norm(axis))

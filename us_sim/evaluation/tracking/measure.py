@@ -1,4 +1,4 @@
-"""A tracker's errors, failures and run time in one case.
+"""Errors, failures and run time of a tracker in one case.
 
 >>> from us_sim.evaluation.tracking.measure import mirror_pose
 >>> tilted = Pose([0.0, 0.0, 0.4], [np.sin(0.1), 0.0, 0.0, np.cos(0.1)])
@@ -26,34 +26,35 @@ from us_sim.tracking.measurement import Measurement
 
 
 class TrackingBench:
-    """Renders cases and tracks them; keeps the room of the last body."""
+    """A bench that renders cases and tracks them; it keeps the renderer of the last body."""
 
     def __init__(self) -> None:
-        self._rooms: dict[tuple[str, str], RenderedView] = {}
+        self._renderers: dict[tuple[str, str], RenderedView] = {}
 
     def measure_case(self, case: TrackingCase, sequences: int) -> list[dict[str, Any]]:
-        """Row of a case, from so many sequences of images; its ``shots`` are a row a view."""
-        seen, camera = MARKERS[case.marker], WEBCAMS[case.image_size]
+        """Measure the row of a case, from sequences of images; ``shots`` has a row a view."""
+        marker, camera = MARKERS[case.marker], WEBCAMS[case.image_size]
         key = (case.marker, case.image_size)
-        is_new = key not in self._rooms
+        is_new = key not in self._renderers
         if is_new:
-            self._rooms = {key: RenderedView(camera, seen.body)}
-        room = self._rooms[key]
+            self._renderers = {key: RenderedView(camera, marker.body)}
+        renderer = self._renderers[key]
         conditions, _ = CONDITIONS[case.condition]
         rows: list[dict[str, Any]] = []
         threads = cv2.getNumThreads()
         cv2.setNumThreads(1)
         try:
             for number in range(sequences):
-                source = CameraSource(camera, seen.body)
+                source = CameraSource(camera, marker.body)
                 seed = zlib.crc32(f"{case.key} {number}".encode())
                 for frame, pose in enumerate(case.make_sequence(number)):
-                    # The hand and the light stay as they are through a sequence, not the noise.
-                    image = room.render(pose, conditions, seed, case.compute_motion(number), frame)
+                    # In a sequence the hand and the light stay, but not the noise.
+                    motion = case.compute_motion(number)
+                    image = renderer.render(pose, conditions, seed, motion, frame)
                     if is_new:  # what is compiled now must not count
-                        CameraSource(camera, seen.body).measure_pose(image, 0)
+                        CameraSource(camera, marker.body).measure_pose(image, 0)
                         is_new = False
-                    rows.append(_measure_view(source, seen, frame, pose, image))
+                    rows.append(_measure_view(source, marker, frame, pose, image))
         finally:
             cv2.setNumThreads(threads)
         views = pd.DataFrame(rows)
@@ -77,9 +78,9 @@ class TrackingBench:
 
 
 def _measure_view(
-    source: CameraSource, seen: Marker, frame: int, true: Pose, image: NDArray[np.uint8]
+    source: CameraSource, marker: Marker, frame: int, true: Pose, image: NDArray[np.uint8]
 ) -> dict[str, Any]:
-    """What the tracker says of one image, and how far it is off."""
+    """Track one image, and measure time and errors."""
     begin, processor = time.perf_counter(), time.thread_time()
     measured = source.measure_pose(image, round(frame * 1e9 / 30))
     processor, wall = time.thread_time() - processor, time.perf_counter() - begin
@@ -87,30 +88,30 @@ def _measure_view(
         "first": frame == 0,  # of a sequence: nothing was known before
         "ms": 1e3 * wall,
         "cpu_ms": 1e3 * processor,
-        "visible": count_visible(seen, true),
+        "visible": count_visible(marker, true),
         "detected": measured is not None,
         "used": source.seen if measured else 0,
-        **_compare_poses(measured, seen, true),
+        **_compare_poses(measured, marker, true),
     }
 
 
-def count_visible(seen: Marker, pose: Pose) -> int:
-    """How many markers of a body face the camera, by less than its usual limit of the angle."""
-    centres = pose.transform_points(seen.body.centres)
-    cosines = -((seen.body.normals @ pose.rotation.T) * centres).sum(axis=1)
+def count_visible(marker: Marker, pose: Pose) -> int:
+    """Count the markers of a body that face the camera within its usual limit of the angle."""
+    centres = pose.transform_points(marker.body.centres)
+    cosines = -((marker.body.normals @ pose.rotation.T) * centres).sum(axis=1)
     cosines /= np.linalg.norm(centres, axis=1)
     return int((cosines > np.cos(VIEW_ANGLE_LIMIT)).sum())
 
 
-def _compare_poses(measured: Measurement | None, seen: Marker, true: Pose) -> dict[str, Any]:
-    """Errors of the body's middle and turn."""
+def _compare_poses(measured: Measurement | None, marker: Marker, true: Pose) -> dict[str, Any]:
+    """Compute the errors of the body's middle and rotation."""
     if measured is None:
         return {"flipped": False, "mm": np.nan, "degrees": np.nan}
     found = measured.pose
-    middle = seen.body.centres.mean(axis=0)
+    middle = marker.body.centres.mean(axis=0)
     off = (found.transform_points(middle[None]) - true.transform_points(middle[None]))[0]
     angle = rotation_angle(found, true)
-    other = rotation_angle(found, mirror_pose(true, middle, seen.front))
+    other = rotation_angle(found, mirror_pose(true, middle, marker.front))
     return {
         "flipped": bool(other < angle and angle > np.radians(5.0)),
         "mm": 1e3 * float(np.linalg.norm(off)),
@@ -119,10 +120,10 @@ def _compare_poses(measured: Measurement | None, seen: Marker, true: Pose) -> di
 
 
 def mirror_pose(pose: Pose, middle: NDArray[np.float64], front: NDArray[np.float64]) -> Pose:
-    """The pose that a plane seen from afar may be taken for: tilted to the other side.
+    """Tilt a body to the other side: from afar a plane looks alike in both poses.
 
-    The pose is of the body in ``camera_optical``; its middle (3,) m, and the unit normal (3,) of
-    its front, are in its own frame.
+    The pose is that of the body in ``camera_optical``; its middle (3,) m, and the unit normal (3,)
+    of its front, are in its own frame.
     """
     sight = pose.transform_points(middle[None])[0]
     sight = sight / np.linalg.norm(sight)

@@ -119,7 +119,7 @@ def _report(table: pd.DataFrame) -> Report:
 
 
 def _tabulate_conditions(shots: pd.DataFrame) -> pd.DataFrame:
-    """How many views of each body and condition are found, and their errors."""
+    """Tabulate the part of views in which each body is found, by condition, and the errors."""
     rows = [
         {
             "marker": marker,
@@ -135,7 +135,7 @@ def _tabulate_conditions(shots: pd.DataFrame) -> pd.DataFrame:
 
 
 def _melt_errors(table: pd.DataFrame) -> pd.DataFrame:
-    """A row an error; ``small`` are the smaller images."""
+    """Make a row of each error; ``small`` marks the smaller images."""
     rows = table.assign(small=table["image_size"] == SMALL)
     kept = [name for name in rows.columns if name not in _ERRORS]
     rows = rows.melt(kept, list(_ERRORS), var_name="of", value_name="error")
@@ -149,16 +149,16 @@ def _draw_errors(table: pd.DataFrame, parameter: str, title: str) -> Figure:
 
 
 def _draw_views() -> Figure:
-    """A row for each condition and a column for each body, cut from the image around it."""
+    """Draw each condition in a row and each body in a column, cut from the image around it."""
     cut = 240  # pixels
-    rooms = {name: RenderedView(WEBCAMS[SMALL], MARKERS[name].body) for name in MARKERS}
+    renderers = {name: RenderedView(WEBCAMS[SMALL], MARKERS[name].body) for name in MARKERS}
     grid: dict[str, dict[str, np.ndarray]] = {}
     for condition, (settings, _) in CONDITIONS.items():
         grid[condition] = {}
-        for name, room in rooms.items():
+        for name, renderer in renderers.items():
             case = TrackingCase(name, SMALL, 0.4, 30.0, condition)
             pose, body = case.make_sequence(0)[0], MARKERS[name].body
-            image = room.render(pose, settings, 3, case.compute_motion(0))
+            image = renderer.render(pose, settings, 3, case.compute_motion(0))
             middle = WEBCAMS[SMALL].project_points(
                 pose.transform_points(body.centres.mean(axis=0)[None])
             )[0]

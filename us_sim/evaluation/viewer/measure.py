@@ -1,4 +1,4 @@
-"""Run the arm with a viewer, and look at it with real browsers.
+"""Run the arm with a viewer, and show it in a real browser.
 
 >>> from us_sim.evaluation.viewer.measure import list_cases
 >>> [str(case) for case in list_cases(quick=True)][:2]
@@ -32,7 +32,7 @@ from us_sim.share import find_bag
 class ViewerCase:
     """One way to run the scene ``upper_arm`` with `us-sim`."""
 
-    who: str  # looks: "no viewer", "viewer without a page", or "1 browser"
+    who: str  # "no viewer", "viewer without a page", or "1 browser"
     by_hand: bool = False  # a page moves the probe; else a path is played at 60 Hz
     seconds: float = 20.0
 
@@ -41,7 +41,7 @@ class ViewerCase:
 
 
 def list_cases(quick: bool) -> list[ViewerCase]:
-    """Cases of a run; in a quick one each takes some seconds."""
+    """List the cases; in a quick run each takes some seconds."""
     chosen = [
         ViewerCase("no viewer"),
         ViewerCase("viewer without a page"),
@@ -52,7 +52,7 @@ def list_cases(quick: bool) -> list[ViewerCase]:
 
 
 BROWSER = "1 browser"
-"""A page in a Chromium without a window, which draws with the processor."""
+"""A page in headless Chromium, which draws with the processor."""
 MOVE = """([x, y, seconds]) => new Promise((resolve) => {
     const target = document.elementFromPoint(x, y);
     const began = performance.now();
@@ -68,7 +68,7 @@ MOVE = """([x, y, seconds]) => new Promise((resolve) => {
         resolve();
     }, 1000 / 60);
 })"""
-"""A drag of 90 CSS pixels and back in 2 s, made within the page: from outside it is slow."""
+"""A drag of 90 CSS pixels and back in 2 s, within the page: from outside it would be slow."""
 
 
 @contextlib.contextmanager
@@ -89,7 +89,7 @@ def show_page(simulation: SimulatorProcess) -> Iterator[BrowserPage]:
         simulation.require_running()
         time.sleep(0.005)
     with sync_playwright() as tool:
-        # As where there is no graphics card.
+        # As without a graphics card.
         drawing = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
         arguments = [*drawing, "--disable-gpu-compositing"]
         browser = tool.chromium.launch(executable_path=chromium, args=arguments)
@@ -104,18 +104,18 @@ def show_page(simulation: SimulatorProcess) -> Iterator[BrowserPage]:
 
 @dataclass
 class BrowserPage:
-    """A page in a browser; without one nothing is shown."""
+    """A page in a browser, or none; then nothing is shown."""
 
     page: Any = None
     opened: float = math.nan  # s, from opening the page to its first image
-    started: float = math.nan  # s, likewise, from the command
+    started: float = math.nan  # s, from the command to the first image
 
     def count_images(self) -> float:
-        """How many images the page has drawn."""
+        """Count the images that the page has drawn."""
         return float(self.page.evaluate("window.usSim.images()")) if self.page else math.nan
 
     def wait_or_drag(self, seconds: float, *, drag: bool) -> None:
-        """Let so long pass, dragging the probe with the mouse over the page's image."""
+        """Wait for some seconds, or drag the probe with the mouse over the page's image."""
         if not self.page:
             time.sleep(max(seconds, 0.0))
             return
@@ -130,7 +130,7 @@ class BrowserPage:
         self.page.mouse.up()
 
     def read_delays(self) -> dict[str, float]:
-        """ms from the pointer to the pixels: median and 99th percentile, and how many there are."""
+        """Read delays (ms) from the pointer to the pixels: median, 99th percentile, and count."""
         found = self.page.evaluate("window.usSim.latency()") if self.page else {}
         return {
             name: float((found or {}).get(name) or math.nan) for name in ("median", "p99", "count")
@@ -141,7 +141,7 @@ _ADDRESS = re.compile(r"http://\S+")
 
 
 def run_case(case: ViewerCase) -> list[dict[str, Any]]:
-    """Look at the arm as the case says, and return its row.
+    """Run the arm as in the case, and return its row.
 
     Raises:
         UsSimError: the simulation ends, or no image comes.
@@ -165,10 +165,10 @@ def run_case(case: ViewerCase) -> list[dict[str, Any]]:
             page.wait_or_drag(min(2.0, case.seconds - passed), drag=case.by_hand)
         ended_ns, seconds = time.time_ns(), time.monotonic() - began
         drawn, delays = page.count_images() - shown, page.read_delays()
-        heard = arrivals.list_arrivals_between(began_ns, ended_ns)
-    images = {stamp for stamp, _ in heard["ultrasound/image"]}
-    poses = {stamp for stamp, _ in heard["tracker/pose"]}
-    ages = [1e-6 * (came - stamp) for stamp, came in heard["ultrasound/image"]]
+        messages = arrivals.list_arrivals_between(began_ns, ended_ns)
+    images = {stamp for stamp, _ in messages["ultrasound/image"]}
+    poses = {stamp for stamp, _ in messages["tracker/pose"]}
+    ages = [1e-6 * (came - stamp) for stamp, came in messages["ultrasound/image"]]
     used = usage.make_columns()
     return [
         {

@@ -1,4 +1,4 @@
-"""`us-sim evaluate viewer`: what a page costs the simulator, and how soon it shows an image."""
+"""`us-sim evaluate viewer`: cost of a page to the simulator, and its delay of images."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _plan_pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
 
 
 def report_viewer(table: pd.DataFrame) -> Report:
-    """What the table says of the page."""
+    """Report the rates, delays and costs of the page."""
 
     def get_value(name: str, column: str) -> float:
         rows = table[table["case"] == name]
