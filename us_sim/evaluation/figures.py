@@ -63,19 +63,20 @@ class PlotOptions:
 def draw_error_over_time(
     table: pd.DataFrame, time: str, error: str, title: str, **options: Any
 ) -> Figure:
-    """Draw an error over a run time, both logarithmic, with `PlotOptions`."""
-    return draw_lines(table, time, error, title, PlotOptions(**{"log": "xy", **options}))
+    """Draw an error over a run time, both logarithmic, with `PlotOptions` by name."""
+    return draw_lines(table, time, error, title, **{"log": "xy", **options})
 
 
 def draw_error_over_parameter(
     table: pd.DataFrame, parameter: str, error: str, title: str, **options: Any
 ) -> Figure:
-    """Draw an error, logarithmic, over a parameter, with `PlotOptions`."""
-    return draw_lines(table, parameter, error, title, PlotOptions(**{"log": "y", **options}))
+    """Draw an error, logarithmic, over a parameter, with `PlotOptions` by name."""
+    return draw_lines(table, parameter, error, title, **{"log": "y", **options})
 
 
-def draw_lines(table: pd.DataFrame, x: str, y: str, title: str, options: PlotOptions) -> Figure:
-    """Draw column ``y`` of a table over column ``x``; a row is a point, drawn if it is finite."""
+def draw_lines(table: pd.DataFrame, x: str, y: str, title: str, **keywords: Any) -> Figure:
+    """Draw column ``y`` of a table over ``x``, a point a row if finite; `PlotOptions` by name."""
+    options = PlotOptions(**keywords)
     table = table[np.isfinite(table[x].astype(float)) & np.isfinite(table[y].astype(float))]
     looks = _choose_looks(table, options)
     groups: dict[Any, pd.DataFrame] = {"": table}

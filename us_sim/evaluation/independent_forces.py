@@ -111,10 +111,7 @@ def compute_neo_hookean_forces(
 def compute_spring_forces(
     edges: NDArray[np.int32], stiffness: Array, rest: Array, displacement: Array
 ) -> Array:
-    """Compute forces (N, 3) N that hold springs of (E,) N/m along edges (E, 2).
-
-    They are undeformed at ``rest`` (N, 3) m.
-    """
+    """Compute forces (N, 3) N that hold springs of (E,) N/m along edges (E, 2), slack at rest."""
     before = rest[edges[:, 1]] - rest[edges[:, 0]]
     moved = displacement[edges[:, 1]] - displacement[edges[:, 0]]
     now = before + moved

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from us_sim.evaluation.figures import PlotOptions, draw_error_over_time, draw_lines
+from us_sim.evaluation.figures import draw_error_over_time, draw_lines
 from us_sim.evaluation.report import fit_exponent
 from us_sim.evaluation.slice.cases import MAIN, PLANES, list_cases
 from us_sim.evaluation.slice.measure import OURS, measure_case
@@ -92,16 +92,11 @@ def _report(table: pd.DataFrame) -> Report:
             "count",
             "cpu_ms_median",
             "Time against pixels and nodes, pressed by 12 mm",
-            PlotOptions(
-                panels="across",
-                lines="method",
-                log="xy",
-                limits={"y:16.7 ms: 60 images a second": 1000.0 / 60.0},
-                labels={
-                    "count": "",
-                    "cpu_ms_median": "processor time of an image, ms (one thread)",
-                },
-            ),
+            panels="across",
+            lines="method",
+            log="xy",
+            limits={"y:16.7 ms: 60 images a second": 1000.0 / 60.0},
+            labels={"count": "", "cpu_ms_median": "processor time of an image, ms (one thread)"},
         ),
         "planes": "; ".join(f"`{name}`: {view.words}" for name, view in PLANES.items()),
     }
