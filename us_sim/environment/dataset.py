@@ -129,14 +129,14 @@ def make_dataset(
     _require_same(out, description)
     orders = list(_plan_episodes(scenes, loaded, settings, out))
     found = {order.name: order.read_facts() for order in orders}
-    left = [order for order in orders if found[order.name] is None]
+    missing = [order for order in orders if found[order.name] is None]
     # In this process first, where kernels are compiled and a volume is made with progress.
-    for order in {order.scene_name: order for order in left}.values():
+    for order in {order.scene_name: order for order in missing}.values():
         _load_environment(order)
     try:
         with Progress("making", len(orders), "episodes") as bar:
-            bar.update(len(orders) - len(left))
-            for order, facts in _make_episodes(left, settings):
+            bar.update(len(orders) - len(missing))
+            for order, facts in _make_episodes(missing, settings):
                 found[order.name] = facts
                 bar.update(sum(each is not None for each in found.values()))
     finally:
