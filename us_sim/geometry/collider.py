@@ -41,6 +41,7 @@ class Sphere(_Shape):
 
     @property
     def offset_box(self) -> NDArray[np.float64]:
+        """(4,) m: a point, rounded."""
         return np.array([0.0, 0.0, 0.0, self.radius])
 
 
@@ -53,6 +54,7 @@ class Capsule(_Shape):
 
     @property
     def offset_box(self) -> NDArray[np.float64]:
+        """(4,) m: a segment along x, rounded."""
         return np.array([self.length / 2, 0.0, 0.0, self.radius])
 
 
@@ -77,6 +79,7 @@ class RoundedBox(_Shape):
 
     @property
     def offset_box(self) -> NDArray[np.float64]:
+        """(4,) m: the box less its rounding, and that."""
         sides = np.array([self.length, self.width, self.height])
         return np.append(sides / 2 - self.rounding, self.rounding)
 
@@ -110,6 +113,7 @@ class Convex(RoundedBox):
 
     @property
     def offset_box(self) -> NDArray[np.float64]:
+        """(5,) m, and 1/m: the box, and the curvature of its front."""
         return np.append(super().offset_box, 1 / (self.radius - self.rounding))
 
 

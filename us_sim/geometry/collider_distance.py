@@ -22,7 +22,7 @@ from us_sim.kernels import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def rotate_vector(r, x, y, z):
-    """The matrix r (3, 3) times a vector: from the child's frame to the parent's."""
+    """Rotate a vector by the matrix r (3, 3): from the child's frame to the parent's."""
     return (
         r[0, 0] * x + r[0, 1] * y + r[0, 2] * z,
         r[1, 0] * x + r[1, 1] * y + r[1, 2] * z,
@@ -32,7 +32,7 @@ def rotate_vector(r, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def rotate_vector_back(r, x, y, z):
-    """Its transpose times a vector: from the parent's frame to the child's."""
+    """Rotate a vector by the transpose of r (3, 3): from the parent's frame to the child's."""
     return (
         r[0, 0] * x + r[1, 0] * y + r[2, 0] * z,
         r[0, 1] * x + r[1, 1] * y + r[2, 1] * z,
@@ -69,7 +69,7 @@ def measure_distances(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def measure_box_distance(box, x, y, z):
-    """Distance and normal for one point of frame ``probe``: (distance, nx, ny, nz).
+    """Measure one point of frame ``probe``: return distance, nx, ny, nz.
 
     ``box`` is a collider's ``offset_box``; its foremost face is z = 0.
     """
@@ -97,7 +97,7 @@ def measure_box_distance(box, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def measure_curved_box_distance(box, grip, x, y, z):
-    """As `measure_box_distance`, of a box with a curved front that goes on behind by ``grip`` m."""
+    """Measure the distance to a box with a curved front that goes on behind by ``grip`` m."""
     radius = 1.0 / box[4]
     end = math.sqrt(radius * radius - box[0] * box[0])  # of the arc, above its centre
     ahead = z + box[3]  # of the foremost point of the core
@@ -137,7 +137,7 @@ def measure_curved_box_distance(box, grip, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _signed_distances(box, rotation, origin, points, distance, normal):
-    """Fills distance (N,) and normal (N, 3) for points (N, 3) of the parent frame."""
+    """Fill distance (N,) and normal (N, 3) for points (N, 3) of the parent frame."""
     r = rotation
     for i in range(len(points)):
         a = points[i, 0] - origin[0]

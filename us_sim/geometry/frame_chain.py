@@ -35,12 +35,12 @@ class PoseHistory:
         self.poses: deque[Pose] = deque(maxlen=_REMEMBERED)
 
     def append_pose(self, stamp: int, pose: Pose) -> None:
-        """Take a pose that is newer than all before."""
+        """Append a pose that is newer than all before."""
         self.stamps.append(stamp)
         self.poses.append(pose)
 
     def clear(self) -> None:
-        """Forget all."""
+        """Forget all poses."""
         self.stamps.clear()
         self.poses.clear()
 
@@ -76,7 +76,7 @@ class FrameChain:
         self._newest: int | None = None  # ns, of the last pose
 
     def find_links(self) -> list[str] | None:
-        """Return the frames from the lowest up to below the top; None while they do not meet."""
+        """Return the frames from the lowest up to below the top; None while a link is missing."""
         found: list[str] = []
         frame = self._frame
         while frame != self._top:
@@ -93,24 +93,24 @@ class FrameChain:
 
     @property
     def is_fixed(self) -> bool:
-        """Whether there is a way, and nothing on it moves."""
+        """True if all links are known and none of them moves."""
         return self.find_links() is not None and not self._find_moving_links()
 
     def forget_motion(self) -> None:
-        """Forget what moved."""
+        """Forget the poses of all moving links."""
         self._newest = None
         for _, link in self._links.values():
             if isinstance(link, PoseHistory):
                 link.clear()
 
     def set_fixed_link(self, frame: str, parent: str, pose: Pose) -> None:
-        """Put a frame for good at a pose in its parent."""
+        """Fix a frame at a pose in its parent."""
         self._links[frame] = parent, pose
 
     def update_link(
         self, frame: str, parent: str, stamp: int, pose: Pose
     ) -> tuple[int, Pose] | None:
-        """Take a frame's pose in its parent at a stamp, ns.
+        """Add a frame's pose in its parent at a stamp (ns).
 
         Returns:
             The stamp and the pose of the lowest frame in the top; None where no later one than the

@@ -13,7 +13,7 @@ MOST_NODES = 2**21  # Most nodes of a mesh, so that the three of a face fit into
 def sort_faces(
     tetrahedra: NDArray[np.integer],
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Face numbers in an order that groups the faces of the same three nodes.
+    """Sort face numbers so that faces of the same three nodes follow one another.
 
     Face f of tetrahedron t, ``FACES[f]``, has the number 4 t + f.
 
@@ -30,12 +30,12 @@ def sort_faces(
 
 
 def find_boundary_triangles(tetrahedra: NDArray[np.integer]) -> NDArray[np.int32]:
-    """(F, 3) triangles that belong to one tetrahedron only, normals pointing outward."""
+    """Return (F, 3) triangles that belong to one tetrahedron only, normals pointing outward."""
     faces = tetrahedra[:, FACES].reshape(-1, 3)[find_boundary_faces(tetrahedra)]
     return np.ascontiguousarray(faces, dtype=np.int32)
 
 
 def find_boundary_faces(tetrahedra: NDArray[np.integer]) -> NDArray[np.intp]:
-    """(F,) ascending numbers, as in `sort_faces`, of the faces of one tetrahedron only."""
+    """Return (F,) ascending numbers, as in `sort_faces`, of the faces of one tetrahedron only."""
     order, starts, counts = sort_faces(tetrahedra)
     return np.sort(order[starts[counts == 1]])

@@ -66,7 +66,7 @@ class Pose:
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> Pose:
-        """The pose of a 4×4 homogeneous rigid matrix.
+        """Return the pose of a 4×4 homogeneous rigid matrix.
 
         Raises:
             PoseError: the upper left block is not a rotation to 1e-3 (scaled, sheared, mirrored).
@@ -104,15 +104,15 @@ class Pose:
         return matrix
 
     def transform_points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points (N, 3) m of the child frame, in the parent frame."""
+        """Transform points (N, 3) m from the child frame to the parent frame."""
         return points @ self.rotation.T + self.position
 
     def inverse(self) -> Pose:
-        """The transform from parent to child."""
+        """Return the transform from parent to child."""
         return Pose(-self.rotation.T @ self.position, self.orientation * [-1.0, -1.0, -1.0, 1.0])
 
     def __matmul__(self, other: Pose) -> Pose:
-        """The transform that does ``other`` first, then this."""
+        """Return the transform that does ``other`` first, then this."""
         turn = multiply_quaternions(self.orientation, other.orientation)
         return Pose(self.rotation @ other.position + self.position, turn)
 
@@ -120,7 +120,7 @@ class Pose:
 def multiply_quaternions(
     first: NDArray[np.float64], second: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Quaternion (4,) x, y, z, w that rotates by the second, then by the first."""
+    """Return the quaternion (4,) x, y, z, w that rotates by the second, then by the first."""
     x1, y1, z1, w1 = first.tolist()
     x2, y2, z2, w2 = second.tolist()
     return np.array(
@@ -134,7 +134,7 @@ def multiply_quaternions(
 
 
 def is_same_pose(a: Pose | None, b: Pose | None) -> bool:
-    """Whether two poses are the same, to the last bit."""
+    """Return True if two poses are the same, to the last bit."""
     if a is None or b is None:
         return a is b
     return np.array_equal(a.position, b.position) and np.array_equal(a.orientation, b.orientation)
@@ -161,5 +161,5 @@ class Placement(Settings):
 
     @property
     def pose(self) -> Pose:
-        """The same as a rigid transform."""
+        """The placement as a rigid transform."""
         return Pose(np.array(self.position), np.array(self.orientation))

@@ -16,13 +16,13 @@ _SMALL = 1e-3  # rad: below it series to the fourth order are exact to rounding
 
 
 def exp(twist: NDArray[np.float64]) -> Pose:
-    """The motion of a twist (6,) m, rad, done for one unit of time (Barfoot 2017, 7.86)."""
+    """Return the motion of a twist (6,) m, rad, done for one unit of time (Barfoot 2017, 7.86)."""
     rotation = twist[3:]
     return Pose(left_jacobian(rotation) @ twist[:3], rotation_exp(rotation))
 
 
 def adjoint(pose: Pose) -> NDArray[np.float64]:
-    """(6, 6): takes twists of the child's frame to the parent's (Barfoot 2017, 7.43)."""
+    """Return the (6, 6) map of twists from the child's frame to the parent's (ibid., 7.43)."""
     rotation = pose.rotation
     matrix = np.zeros((6, 6))
     matrix[:3, :3] = matrix[3:, 3:] = rotation
@@ -31,7 +31,7 @@ def adjoint(pose: Pose) -> NDArray[np.float64]:
 
 
 def interpolate_poses(first: Pose, second: Pose, fraction: float) -> Pose:
-    """The pose at a fraction (0 to 1) of the path, which is straight and takes the shorter turn."""
+    """Return the pose at a fraction (0 to 1) of the straight path with the shorter turn."""
     turn = fraction * rotation_between(first.orientation, second.orientation)
     return Pose(
         first.position + fraction * (second.position - first.position),
@@ -40,7 +40,7 @@ def interpolate_poses(first: Pose, second: Pose, fraction: float) -> Pose:
 
 
 def rotation_exp(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit quaternion (4,) x, y, z, w of a rotation vector (3,) rad."""
+    """Return the unit quaternion (4,) x, y, z, w of a rotation vector (3,) rad."""
     x, y, z = vector.tolist()
     square = x * x + y * y + z * z
     angle = sqrt(square)
@@ -49,7 +49,7 @@ def rotation_exp(vector: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def rotation_log(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation vector (3,) rad, of at most pi, of a unit quaternion (4,) x, y, z, w."""
+    """Return the rotation vector (3,) rad, of at most pi, of a unit quaternion (4,) x, y, z, w."""
     x, y, z, w = quaternion.tolist()
     if w < 0.0:
         x, y, z, w = -x, -y, -z, -w
@@ -67,7 +67,7 @@ def rotation_between(
 
 
 def left_jacobian(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) J: exp(v + d) is exp(J d) exp(v) to the first order in d (Barfoot 2017, 7.37)."""
+    """Return (3, 3) J: exp(v + d) = exp(J d) exp(v) to first order in d (Barfoot 2017, 7.37)."""
     x, y, z = vector.tolist()
     square = x * x + y * y + z * z
     angle = sqrt(square)
@@ -87,6 +87,6 @@ def left_jacobian(vector: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def cross_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) matrix that takes any u to vector × u."""
+    """Return the (3, 3) matrix that takes any u to vector × u."""
     x, y, z = vector.tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -75,7 +75,7 @@ class TransducerPart:
 
 
 def build_transducer_mesh(collider: Collider) -> list[TransducerPart]:
-    """The parts of a transducer whose face has the shape of ``collider``."""
+    """Build the parts of a transducer whose face has the shape of ``collider``."""
     box = collider.offset_box
     half_x, half_y, rounding = float(box[0]), float(box[1]), float(box[3])
     curvature = float(box[4]) if len(box) > 4 else 0.0
@@ -121,7 +121,7 @@ def build_transducer_mesh(collider: Collider) -> list[TransducerPart]:
 
 
 def _outline(half_x: float, half_y: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points (P, 2) of a box's outline and outward directions (P, 2) there, turning from +y to +x.
+    """Return points (P, 2) of a box's outline and outward directions (P, 2), from +y to +x.
 
     The same number of points for every box, those of a side that has no length at one place.
     """
@@ -140,7 +140,7 @@ def _outline(half_x: float, half_y: float) -> tuple[NDArray[np.float64], NDArray
 
 
 def _flat_ring(half_x: float, half_y: float, rounding: float, z: float) -> NDArray[np.float64]:
-    """(P, 3) m: the outline of a box, grown by a rounding, at a height z."""
+    """Return the outline (P, 3) m of a box, grown by a rounding, at a height z."""
     points, directions = _outline(half_x, half_y)
     ring = points + rounding * directions
     return np.column_stack([ring, np.full(len(ring), z)])
@@ -149,7 +149,7 @@ def _flat_ring(half_x: float, half_y: float, rounding: float, z: float) -> NDArr
 def _face_rings(
     half_x: float, half_y: float, rounding: float, curvature: float
 ) -> tuple[list[NDArray], NDArray]:
-    """Rings on the collider: of the front, from its middle line outwards, and the last, its side.
+    """Return rings on the collider: of the front, from its middle line outwards; and of the side.
 
     A point of a ring is one of the core's front, grown by the rounding along a normal there: of
     those between the front's own and the outline's direction.
@@ -171,17 +171,16 @@ def _face_rings(
 
 
 def _turn_ring(ring: NDArray[np.float64], scale: tuple[float, float]) -> NDArray[np.float64]:
-    """A ring around z as one around x, its sizes along y and z scaled."""
+    """Turn a ring around z into one around x, with sizes along y and z scaled."""
     return np.column_stack([ring[:, 2], -ring[:, 0] * scale[0], ring[:, 1] * scale[1]])
 
 
 def _build_part(
     name: str, colour: Colour, rings: Sequence[NDArray], has_front: bool = True
 ) -> TransducerPart:
-    """Bands from ring to ring, and flat ends; points that are at the same place are one.
+    """Join rings by bands, and close them by flat ends; merge points at the same place.
 
-    Args:
-        has_front: whether the first ring gets an end, which one that is a line needs not.
+    A first ring that is a line needs no front.
     """
     count = len(rings[0])
     vertices = np.concatenate([*rings, [rings[0].mean(axis=0), rings[-1].mean(axis=0)]])
@@ -201,7 +200,7 @@ def _build_part(
 
 
 def _merge_vertices(vertices: NDArray, triangles: NDArray) -> tuple[NDArray, NDArray]:
-    """The same with points that lie on each other, to a nanometre, as one."""
+    """Merge vertices that lie on each other, to a nanometre; drop triangles that vanish."""
     _, first, which = np.unique(
         np.rint(vertices * 1e9), axis=0, return_index=True, return_inverse=True
     )

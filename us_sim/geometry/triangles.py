@@ -21,7 +21,7 @@ _Real = TypeVar("_Real", np.float32, np.float64)
 
 
 def compute_vertex_normals(vertices: NDArray[_Real], triangles: ArrayLike) -> NDArray[_Real]:
-    """(N, 3) unit normals: sums of the adjacent triangles' normals weighted by their area.
+    """Compute (N, 3) unit normals: sums of the adjacent triangles' normals weighted by area.
 
     They point to the side from which the triangles turn anticlockwise. Where the sum is zero, so
     is the normal.
@@ -41,7 +41,7 @@ def compute_vertex_normals(vertices: NDArray[_Real], triangles: ArrayLike) -> ND
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sum_normals(vertices, triangles, normals):
-    """Fills normals (N, 3), zeros before, from vertices (N, 3) and triangles (T, 3)."""
+    """Fill normals (N, 3), zeros before, from vertices (N, 3) and triangles (T, 3)."""
     for t in range(len(triangles)):
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         ax = vertices[j, 0] - vertices[i, 0]
@@ -70,9 +70,7 @@ _FELT, _FINEST = 1.0, 0.25
 
 
 def choose_part_size(rounding: float, spacing: float) -> float:
-    """m, the longest side of a triangle's parts, for a probe of some rounding (m) and vertices that
-    are ``spacing`` (m) apart.
-    """
+    """Choose the longest side of a triangle's parts (m), by rounding and vertices' spacing (m)."""
     return min(max(_FELT * rounding, _FINEST * spacing), spacing)
 
 
@@ -97,7 +95,7 @@ class TriangleParts:
 
 
 def _middles(count: int) -> NDArray[np.float64]:
-    """(count^2, 3) barycentric coordinates of the middles of a triangle's equal parts."""
+    """Return (count^2, 3) barycentric coordinates of the middles of a triangle's equal parts."""
     row, column = np.divmod(np.arange(count * count), count)
     lower = row + column < count
     first = np.column_stack([row, column])[lower] + 1 / 3

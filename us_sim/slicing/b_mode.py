@@ -82,7 +82,7 @@ class BMode:
     def apply_settings(
         self, probe: Probe, imaging: Imaging, acoustics: Acoustics | None = None
     ) -> None:
-        """Use another probe, or other settings, from the next image on.
+        """Apply another probe, or other settings, from the next image on.
 
         Raises:
             ProbeError: as for the class.
@@ -159,12 +159,13 @@ class BMode:
         number: int = 0,
         time: float = 0.0,
     ) -> Frame:
-        """The image with the probe at ``pose``, made as far as it is asked for.
+        """Make the frame with the probe at ``pose``, whose images are made when first asked for.
 
         Args:
-            nodes: (N, 3) m, where the carrying mesh is; None for the volume as it is. Kept, not
-                copied.
+            pose: of the probe.
+            nodes: (N, 3) m, of the carrying mesh; None for the volume as it is. Kept, not copied.
             skin: (V, 3) m, where the vertices given to `attach_skin` are.
+            number: of the poses so far.
             time: s since 1970, of the pose.
         """
         touches = self._formation.needs_contact
@@ -188,20 +189,17 @@ class BMode:
     def render_image(
         self, pose: Pose, nodes: NDArray[np.float64] | None = None
     ) -> NDArray[np.uint8]:
-        """The B-mode image (rows, columns) with the probe at ``pose``: `Frame.pixels`.
-
-        Args:
-            nodes: (N, 3) m, where the carrying mesh is; None for the volume as it is.
+        """Render the B-mode image (rows, columns) with the probe at ``pose``: `Frame.pixels`.
 
         Raises:
-            MeshError, ProbeError, VolumeError: as for `Frame`.
+            MeshError, ProbeError, VolumeError: as for `make_frame`'s arguments and `Frame`.
         """
         return self.make_frame(pose, nodes).pixels
 
     def render_labels(
         self, pose: Pose, nodes: NDArray[np.float64] | None = None
     ) -> NDArray[np.uint8]:
-        """The volume's label at each pixel (rows, columns), 0 where there is nothing.
+        """Render the volume's label at each pixel (rows, columns), 0 where there is nothing.
 
         Raises:
             MeshError, ProbeError, VolumeError: as for `Frame.render_labels`.
@@ -209,7 +207,7 @@ class BMode:
         return self.make_frame(pose, nodes).labels
 
     def measure_excess_depth(self, pose: Pose, *, pressed: bool = True) -> float:
-        """m by which the middle beam reaches beyond the mesh at rest, or the volume without one.
+        """Return the m by which the middle beam reaches beyond the mesh at rest, or the volume.
 
         Args:
             pose: of the probe.
@@ -244,7 +242,7 @@ class BMode:
 
 
 def _outer_box(volume: Volume) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """The outer faces of a volume's voxels: 8 corners (8, 3) m and 12 triangles."""
+    """Return the outer faces of a volume's voxels: 8 corners (8, 3) m and 12 triangles."""
     # Corners by the bits of x, y and z in their number; faces outward.
     faces = (0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)
     bits = np.array([[(corner >> axis) & 1 for axis in range(3)] for corner in range(8)])
@@ -257,7 +255,7 @@ def _outer_box(volume: Volume) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
 def measure_excess_depth(
     probe: Probe, pose: Pose, extent: NDArray[np.float64], *, pressed: bool = True
 ) -> float:
-    """m of the middle beam that lie behind a box; 0 where it ends within it or never enters it.
+    """Return the m of the middle beam behind a box; 0 where it ends within or never enters it.
 
     Args:
         probe: whose beam it is.

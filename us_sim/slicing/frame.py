@@ -111,7 +111,7 @@ class Frame:
 
     @cached_property
     def located(self) -> LocatedPixels:
-        """Where each pixel lies in the mesh.
+        """The tetrahedron and the rest place of each pixel.
 
         Raises:
             MeshError: there is no mesh.
@@ -122,7 +122,7 @@ class Frame:
 
     @property
     def placed(self) -> LocatedPixels:
-        """Where each pixel lies in the mesh, or in the volume as it is."""
+        """The place of each pixel in the mesh, or in the volume as it is."""
         return self._rigid if self.nodes is None or self.slicer is None else self.located
 
     @cached_property
@@ -135,13 +135,13 @@ class Frame:
         )
 
     def locate_pixel_subset(self, steps: tuple[int, int]) -> LocatedPixels:
-        """Where every so many-th row and column lies in the mesh, see `Slicer.locate_pixel_subset`."""
+        """Locate every n-th row and column, see `Slicer.locate_pixel_subset`."""
         if self.nodes is None or self.slicer is None or "located" in self.__dict__:
             return self.located.take_every(steps)
         return self.slicer.locate_pixel_subset(self.nodes, self.plane, steps)
 
     def sample_plane(self, plane: SlicePlane) -> NDArray[np.uint8]:
-        """The volume's grey values (rows, columns) on a plane, as the tissue carries them now."""
+        """Sample the volume's grey values (rows, columns) on a plane, as tissue carries them."""
         if self.nodes is None or self.slicer is None:
             return sample_plane(self.volume, plane, threads=self.threads)
         return self.slicer.cut_image(self.nodes, plane)

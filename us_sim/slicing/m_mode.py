@@ -63,7 +63,7 @@ class SweepPicture:
         return self._grey
 
     def advance_to(self, time: float) -> NDArray[np.float64]:
-        """The times (K,) s of the columns to be added now, up to ``time``.
+        """Advance to ``time``; return the times (K,) s of the columns to be added.
 
         After time went back, or stood still for longer than the picture, it begins anew.
         """
@@ -84,7 +84,7 @@ class SweepPicture:
             self._grey[:, -count:] = columns
 
     def draw_picture(self) -> NDArray[np.uint8]:
-        """A new picture of red, green and blue, with its scales."""
+        """Draw a new picture of red, green and blue, with its scales."""
         rows, columns = self._grey.shape
         picture = self._frame.copy()
         picture[:rows, :columns] = self._grey[:, :, None]
@@ -94,7 +94,7 @@ class SweepPicture:
 
 
 def _choose_tick_values(low: float, high: float) -> list[float]:
-    """Multiples of 1, 2 or 5 times a power of ten in that range, ends included; a few of them."""
+    """Return a few multiples of 1, 2 or 5 times a power of ten in a range, ends included."""
     rough = (high - low) / _MOST
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(step for step in (power, 2 * power, 5 * power, 10 * power) if step >= rough)
@@ -121,18 +121,18 @@ class MMode:
         )
 
     def take_over_picture(self, before: MMode) -> None:
-        """Go on with the picture of a line that looked elsewhere, if its scales are the same."""
+        """Continue the picture of another line, if its scales are the same."""
         if before._picture.layout == self._picture.layout:
             self._picture = before._picture
 
     def sample_line(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Grey values (rows,) along the line of an image (rows, columns), from the face down."""
+        """Sample grey values (rows,) along the line of an image (rows, columns), from the top."""
         linear, edge = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
         line = cv2.remap(image, self._column, self._row, linear, borderMode=edge)
         return np.asarray(line, dtype=np.uint8)[:, 0]
 
     def draw_sweep(self, image: NDArray[np.uint8], time: float) -> NDArray[np.uint8]:
-        """The picture (rows, columns, 3) up to the image at a time (s), with its scales.
+        """Draw the picture (rows, columns, 3) up to the image at a time (s), with its scales.
 
         Between two images it shows the later one.
         """

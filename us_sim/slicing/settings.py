@@ -124,7 +124,7 @@ class Imaging(Settings):
 
     @property
     def changes_grey_levels(self) -> bool:
-        """Whether echoes are shown with grey values other than the volume's own."""
+        """True if echoes are shown with grey values other than the volume's own."""
         plain = (0.0, ECHO_RANGE, "linear")
         return any(self.time_gain) or plain != (self.gain, self.dynamic_range, self.grey_map)
 

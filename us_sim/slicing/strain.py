@@ -17,9 +17,9 @@ volumes (Zienkiewicz and Zhu, Int. J. Numer. Methods Eng. 24:337, 1987), and lin
 >>> volume = Volume(np.zeros((41, 41, 41), np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
 >>> mesh = box_mesh([0.0, 0.02, 0.04], [0.0, 0.04], [0.0, 0.04])
 >>> scanner = BMode(volume, LinearProbe(aperture=0.01, depth=0.02, columns=2, rows=3))
->>> scanner.carry(mesh.nodes, mesh.tetrahedra)
->>> frame = scanner.frame(Pose([0.02, 0.02, 0.01]), mesh.nodes * [1.02, 1.02, 0.95])
->>> AxialStrain.of(frame).compute_strain(frame)[:, 0].round(4)
+>>> scanner.attach_mesh(mesh.nodes, mesh.tetrahedra)
+>>> frame = scanner.make_frame(Pose([0.02, 0.02, 0.01]), mesh.nodes * [1.02, 1.02, 0.95])
+>>> AxialStrain.from_frame(frame).compute_strain(frame)[:, 0].round(4)
 array([-0.05, -0.05, -0.05], dtype=float32)
 """
 
@@ -40,7 +40,7 @@ from us_sim.slicing.probe.probe import LinearProbe, Probe
 
 
 def compute_displacement(frame: Frame) -> NDArray[np.float32]:
-    """(rows, columns, 2) m: the tissue's way from rest to each pixel, lateral and axial.
+    """Compute (rows, columns, 2) m: the tissue's way from rest to each pixel, lateral and axial.
 
     These are its components along +x and +z of frame ``probe`` as the probe is now; the part across
     the image is left out. It is the way in frame ``patient``: the probe's own motion is no part of
@@ -62,16 +62,16 @@ def compute_displacement(frame: Frame) -> NDArray[np.float32]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_nodal_deformation(
+def fill_nodal_deformation(  # noqa: PLR0913
     shown, tetrahedra, starts, members, before, now, to_pixel, pixel_volume, steps, place, deformed,
     done, mean,
 ):  # fmt: skip
-    """Fills ``mean`` (N, 3) at the nodes of the tetrahedra that are shown.
+    """Fill ``mean`` (N, 3) at the nodes of the tetrahedra that are shown.
 
     It is c in the image's plane: lateral by lateral, lateral by axial, axial by axial. A node
     around which all tetrahedra are inverted or flat is left without deformation: 1, 0, 1.
 
-    Args:
+    Shapes and units:
         shown: (E,) numbers of tetrahedra. tetrahedra: (M, 4) nodes.
         starts, members: (N + 1,) and (4 M,), the tetrahedra around each node.
         before, now: (N, 3) m, nodes in the other state and now.
@@ -113,7 +113,7 @@ def fill_nodal_deformation(
 
 @njit(inline="always", error_model="numpy")
 def _deform(tetrahedra, e, before, place, pixel_volume, steps, deformed):
-    """Fills a tetrahedron's row: its volume now in any unit (0 if it is not solid), and c."""
+    """Fill a tetrahedron's row: its volume now in any unit (0 if it is not solid), and c."""
     n0, n1, n2, n3 = tetrahedra[e, 0], tetrahedra[e, 1], tetrahedra[e, 2], tetrahedra[e, 3]
     size, to_1, to_2, to_3 = compute_adjugate(place, n0, n1, n2, n3)
     ax = before[n1, 0] - before[n0, 0]
@@ -146,9 +146,9 @@ def _deform(tetrahedra, e, before, place, pixel_volume, steps, deformed):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_pixel_maps(shown, tetrahedra, place, mean, maps):
-    """Fills ``maps`` (E, 3, 3): coefficients of (1, column, row) of the nodes' values.
+    """Fill ``maps`` (E, 3, 3): coefficients of (1, column, row) of the nodes' values.
 
-    Args:
+    Shapes and units:
         shown: (E,) numbers of tetrahedra. tetrahedra: (M, 4) nodes.
         place: (N, 3) column, row and height of the nodes.
         mean: (N, 3), as `fill_nodal_deformation` fills it.
@@ -191,7 +191,7 @@ class AxialStrain:
 
     @classmethod
     def from_frame(cls, frame: Frame) -> AxialStrain:
-        """The strain of the mesh that carries the volume in a frame.
+        """Make the strain of the mesh that carries the volume in a frame.
 
         Raises:
             MeshError: there is none.
@@ -203,9 +203,10 @@ class AxialStrain:
     def compute_strain(
         self, frame: Frame, before: NDArray[np.float64] | None = None
     ) -> NDArray[np.float32]:
-        """(rows, columns): the strain along each pixel's beam, negative where tissue got shorter.
+        """Compute the strain (rows, columns) along each pixel's beam, negative where it shortens.
 
         Args:
+            frame: the image.
             before: (N, 3) m, where the nodes were; None for at rest.
 
         Returns:
@@ -246,7 +247,7 @@ class AxialStrain:
         return room
 
     def _directions_of(self, probe: Probe) -> NDArray[np.float32]:
-        """As `Probe.pixel_directions`; of one row and column where all beams are parallel."""
+        """Return `Probe.pixel_directions`; one row and column where all beams are parallel."""
         if self._directions is None or self._directions[0] is not probe:
             directions = probe.pixel_directions
             if isinstance(probe, LinearProbe):
@@ -257,9 +258,9 @@ class AxialStrain:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _strain(maps, elements, directions, first_row, end_row, values):
-    """Fills rows of ``values`` (rows, columns) a run of pixels of one tetrahedron at a time.
+    """Fill rows of ``values`` (rows, columns) a run of pixels of one tetrahedron at a time.
 
-    Args:
+    Shapes and units:
         maps: (E, 3, 3) as `fill_pixel_maps` fills them. elements: (rows, columns).
         directions: (2, rows, columns) x and z of each pixel's beam, or (2, 1, 1) for 0 and 1.
     """
@@ -317,7 +318,7 @@ class ImageCompression(NamedTuple):
 
 
 def measure_compression(strain: NDArray[np.floating]) -> ImageCompression:
-    """The compression of an image (any shape) of strain, NaN where there is no tissue."""
+    """Measure the compression in an image (any shape) of strain, NaN where there is no tissue."""
     there = strain[np.isfinite(strain)].astype(np.float64)
     if not there.size:
         return ImageCompression(0.0, 0.0)
@@ -340,7 +341,7 @@ class AdaptiveScale:
         self._end = 0.0
 
     def update_end(self, values: NDArray[np.floating]) -> float:
-        """The end for an image (rows, columns), NaN where there is no strain."""
+        """Return the bar's end for an image (rows, columns), NaN where there is no strain."""
         sizes = np.abs(values[::_STEP, ::_STEP])
         sizes = sizes[np.isfinite(sizes)]
         most = float(np.percentile(sizes, _HELD)) if sizes.size else 0.0
@@ -350,6 +351,6 @@ class AdaptiveScale:
 
 
 def make_strain_scale(name: str, most: float) -> ColourScale:
-    """Colours from -most to most, in percent; red and blue differ to colour-blind eyes, too."""
+    """Make colours from -most to most, in percent; red and blue suit colour-blind eyes, too."""
     title = name.replace("_", " ")
     return ColourScale(title, -most, most, "%", factor=100.0, colours=_COLOURS)

@@ -41,10 +41,11 @@ from us_sim.volume.volume import Volume
 
 
 def fit_slopes(values: ArrayLike, weight: ArrayLike, length: int) -> NDArray[np.float32]:
-    """The slope (per sample) at each sample of (samples, lines) values, down the columns.
+    """Fit the slope (per sample) at each sample of (samples, lines) values, down the columns.
 
     Args:
-        values, weight: (samples, lines); values without weight may be anything finite.
+        values: (samples, lines), finite also where they have no weight.
+        weight: (samples, lines).
         length: samples of the line that is fitted, odd.
 
     Returns:
@@ -82,10 +83,11 @@ Window = tuple[Field, Field, Field]
 def track_displacement(
     earlier: ArrayLike, later: ArrayLike, *, window: tuple[int, int], search: int
 ) -> tuple[Field, Field]:
-    """Displacement of each sample of the later image along its beam, in samples.
+    """Track the displacement of each sample of the later image along its beam, in samples.
 
     Args:
-        earlier, later: (samples, lines) of grey values, 0 to 255.
+        earlier: (samples, lines) of grey values, 0 to 255.
+        later: likewise.
         window: samples and lines of what is looked for, odd.
         search: samples to either side.
 
@@ -108,7 +110,7 @@ def track_displacement(
 
 
 def _ends(moved: Field, correlation: Field, half: int, search: int) -> tuple[int, int]:
-    """The first sample, and the one after the last, whose windows were all in the earlier image.
+    """Return first and end of the samples whose windows lay wholly in the earlier image.
 
     What has come from beyond an end is not found, or found elsewhere. How far things moved there
     is told by the nearest windows that can have come from nowhere else.
@@ -127,7 +129,7 @@ def _ends(moved: Field, correlation: Field, half: int, search: int) -> tuple[int
 
 
 def _search(first: Field, later: Window, size: tuple[int, int], most: int) -> tuple[Field, Field]:
-    """Lag in samples at which the correlation is largest, and that correlation."""
+    """Return the lag in samples at which the correlation is largest, and that correlation."""
     around = cv2.copyMakeBorder(first, most + 1, most + 1, 0, 0, cv2.BORDER_REFLECT_101)
     earlier = around, *_moments(around, size)
     best = np.full_like(first, -np.inf)
@@ -154,7 +156,7 @@ def _search(first: Field, later: Window, size: tuple[int, int], most: int) -> tu
 def _refine(
     first: Field, later: Window, size: tuple[int, int], moved: Field
 ) -> tuple[Field, Field]:
-    """The same in the image warped by the known displacement, up to a sample from there."""
+    """Search again in the image warped by the known displacement, up to a sample from there."""
     levels = []
     for lag in (-1.0, 0.0, 1.0):
         warped = np.empty_like(first)
@@ -194,7 +196,7 @@ def _correlation(one: Window, other: Window, size: tuple[int, int]) -> Field:
 
 
 def _tip(before: Field, middle: Field, after: Field, most: float) -> Field:
-    """Peak of a parabola through three values a sample apart, counted from the middle one."""
+    """Return the peak of a parabola through three values a sample apart, from the middle one."""
     bend = np.minimum(before - 2.0 * middle + after, np.float32(-1e-6))
     return np.asarray(np.clip(0.5 * (before - after) / bend, -most, most), dtype=np.float32)
 
@@ -245,8 +247,7 @@ def estimate_strain(
 ) -> StrainEstimate:
     """Track the earlier image's windows along the beams, and fit lines to their displacement.
 
-    Args:
-        earlier, later: (rows, columns) images of the probe.
+    Both images are (rows, columns), of the probe.
 
     Raises:
         ProbeError: a window is longer than half a beam.
@@ -290,7 +291,7 @@ def _odd(count: float) -> int:
 
 
 def _to_pixels(values: NDArray[np.float32], probe: Probe) -> NDArray[np.float32]:
-    """(rows, columns) of values along the beams (samples, lines); NaN where no beam reaches."""
+    """Convert values along the beams (samples, lines) to (rows, columns); NaN beside the beams."""
     lines, distances = probe.pixel_beams
     samples = distances * np.float32(probe.samples / probe.depth) - np.float32(0.5)
     beside = np.isnan(lines)
@@ -313,7 +314,7 @@ class FrameHistory:
         self._frames: deque[tuple[int, Any]] = deque()
 
     def get_before(self, frame: Frame, interval: int) -> Any:
-        """The value kept of the frame ``interval`` before, or None; this frame's is kept, too.
+        """Return the value kept of the frame ``interval`` before, or None; keep this frame's, too.
 
         A frame may be asked about again.
         """

@@ -113,7 +113,7 @@ class BeamAcoustics:
         self._runs = make_full_runs(plane) if plane.spans is None else plane.spans
 
     def resolve_imaging(self, imaging: Imaging) -> Imaging:
-        """The console's settings with the blur of a frequency below the volume's own.
+        """Add to the console's settings the blur of a frequency below the volume's own.
 
         A point is as long as 1.5 wavelengths and as wide as a wavelength times the f-number, 2
         (Szabo 2014, section 6.6). The blur of the volume's own frequency is taken off in squares.
@@ -143,7 +143,7 @@ class BeamAcoustics:
             self._fibres.attach_mesh(rest_nodes, self._corners)
 
     def compute_gain(self, frame: Frame) -> NDArray[np.float32]:
-        """(samples, beams) dB to add to the volume's echoes: time gain less all that is lost.
+        """Return (samples, beams) dB to add to the volume's echoes: time gain less all losses.
 
         It is overwritten by the next one.
         """
@@ -170,7 +170,7 @@ class BeamAcoustics:
         return self._gain[:, : grid.beams]
 
     def apply_acoustics(self, image: NDArray[np.uint8], frame: Frame) -> NDArray[np.uint8]:
-        """A slice of echoes (rows, columns) as the frame's beams bring them."""
+        """Return a slice of echoes (rows, columns) as the frame's beams bring them."""
         gain = self.compute_pixel_gain(frame)
         out = np.empty_like(image)
         _add_gain(image, gain, np.float32(GREYS_PER_DECIBEL), self._dither, out)
@@ -181,7 +181,7 @@ class BeamAcoustics:
         return out
 
     def compute_pixel_gain(self, frame: Frame) -> NDArray[np.float32]:
-        """(rows, columns) dB to add to the volume's echoes."""
+        """Return (rows, columns) dB to add to the volume's echoes."""
         gain = self.grid.interpolate_to_pixels(self.compute_gain(frame))
         if self.grid.is_linear:
             sharpen_borders(
@@ -218,13 +218,13 @@ class BeamAcoustics:
 
 
 def _apart(shape: tuple[int, int], kind: type[np.number]) -> NDArray[Any]:
-    """Zeros with so many columns that rows do not compete for the same lines of a cache."""
+    """Return zeros, padded in columns so that rows do not compete for the same lines of a cache."""
     lines = -(-shape[1] // 16) | 1  # of 64 bytes, an odd number
     return np.zeros((shape[0], 16 * lines), dtype=kind)
 
 
 def _dither(columns: int) -> NDArray[np.float32]:
-    """(8, columns) thresholds from 0 to 1, even along rows: means of rounded greys are right."""
+    """Return (8, columns) thresholds from 0 to 1, even along rows, that keep the mean grey."""
     row, column = np.arange(8)[:, None], np.arange(columns)[None, :]
     # Multiples of irrational numbers modulo 1 (Roberts, quasirandom sequences).
     return np.asarray((0.5 + 0.7548776662 * column + 0.5698402910 * row) % 1.0, dtype=np.float32)
@@ -232,7 +232,7 @@ def _dither(columns: int) -> NDArray[np.float32]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_gain(image, gain, greys, dither, out):
-    """Grey levels (rows, columns) with gain (rows, columns) dB; no echo stays none."""
+    """Add gain (rows, columns) dB to grey levels (rows, columns); no echo stays none."""
     for row in range(image.shape[0]):
         line, add, result = image[row], gain[row], out[row]
         threshold = dither[row & 7]
@@ -275,7 +275,7 @@ class ElectronicNoise:
         return grey.astype(np.uint8)
 
     def make_noise(self, pose: Pose) -> NDArray[np.uint8]:
-        """(rows, columns) grey levels with the probe at a pose."""
+        """Return (rows, columns) grey levels of noise with the probe at a pose."""
         bits = np.concatenate([pose.position, pose.orientation]).view(np.uint64)
         return self._frames[int(np.bitwise_xor.reduce(bits) % np.uint64(251)) % _FRAMES]
 
@@ -312,10 +312,12 @@ class Fibres:
     def compute_directions(
         self, located: LocatedPixels, nodes: NDArray[np.float64], plane: SlicePlane
     ) -> NDArray[np.float32]:
-        """(E + 1, D, 2): x and z along the image of the unit direction in each map's tissue.
+        """Return (E + 1, D, 2): x and z along the image of the unit direction in each map's tissue.
 
         Args:
+            located: the maps, and the tetrahedra that they are of.
             nodes: (N, 3) m, where the mesh is now.
+            plane: of the image.
         """
         across, down = (step / np.linalg.norm(step) for step in (plane.column_step, plane.row_step))
         out = np.empty((len(located.maps), len(self._rest), 2), dtype=np.float32)

@@ -24,22 +24,22 @@ _FAINTEST = -200.0  # dB, in place of nothing
 
 
 def convert_attenuation(attenuation: float, frequency: float) -> float:
-    """dB/m that an echo loses there and back, at an attenuation in dB/cm/MHz and Hz."""
+    """Return the dB/m that an echo loses there and back, at an attenuation in dB/cm/MHz and Hz."""
     return 2.0 * attenuation * 100.0 * frequency * 1e-6
 
 
 def compute_reflection(before: float, behind: float) -> float:
-    """The fraction of the amplitude that a border of two impedances (Rayl) reflects."""
+    """Return the fraction of the amplitude that a border of two impedances (Rayl) reflects."""
     return (behind - before) / (behind + before)
 
 
 def compute_crossing_loss(before: float, behind: float) -> float:
-    """dB that a border takes from an echo from behind it, there and back."""
+    """Return the dB that a border takes from an echo from behind it, there and back."""
     return float(-20.0 * np.log10(max(1.0 - compute_reflection(before, behind) ** 2, 1e-10)))
 
 
 def collect_label_constants(volume: Volume, acoustics: Acoustics) -> dict[int, TissueAcoustics]:
-    """The constants of each label that has a name, and of 0.
+    """Return the constants of each label that has a name, and of 0.
 
     Raises:
         ProbeError: a label has none, or there are constants of a label that there is not.
@@ -63,10 +63,13 @@ def collect_label_constants(volume: Volume, acoustics: Acoustics) -> dict[int, T
 def build_media(
     volume: Volume, acoustics: Acoustics, frequency: float, step: float
 ) -> tuple[Media, list[TissueAcoustics], NDArray[np.float64]]:
-    """The tables, the constants of media 1 and up, and the directions of fibres (D, 3).
+    """Return the tables, the constants of media 1 and up, and the directions of fibres (D, 3).
 
     Args:
-        frequency: Hz. step: m, between samples.
+        volume: whose labels the media are of.
+        acoustics: the settings.
+        frequency: Hz.
+        step: m, between samples.
 
     Raises:
         ProbeError: as `collect_label_constants`.
@@ -114,7 +117,7 @@ def build_media(
 
 
 def compute_surface_levels(constants: Sequence[TissueAcoustics]) -> NDArray[np.float32]:
-    """(media, media) dB: the echo of a border at a right angle, where the strongest shown is 0."""
+    """Return (media, media) dB: echoes of borders at a right angle; the strongest shown is 0."""
     count = 1 + len(constants)
     levels = np.full((count, count), _FAINTEST)
     for a, before in enumerate(constants, 1):
@@ -192,7 +195,7 @@ class BeamGrid:
         )
 
     def _places(self, probe: Probe) -> NDArray[np.int32]:
-        """(beams, samples): which of the located pixels, flat, is nearest to each sample.
+        """Return (beams, samples): the flat index of the located pixel nearest to each sample.
 
         Of those that beams reach, since the nearest of all may lie beside a fan.
         """
@@ -205,7 +208,7 @@ class BeamGrid:
         return np.ascontiguousarray((row * many + column).T, dtype=np.int32)
 
     def _pixel_places(self, probe: Probe) -> tuple[NDArray, NDArray]:
-        """Sample and beam of each pixel, in the form that `cv2.remap` takes."""
+        """Return sample and beam of each pixel, in the form that `cv2.remap` takes."""
         line, distance = probe.pixel_beams
         row, column = _nearest(~np.isnan(line))
         beam = (line[row, column] + 0.5) * (self.beams / probe.lines) - 0.5
@@ -221,7 +224,7 @@ class BeamGrid:
         return self.samples * self.pixels[0], self.beams * self.pixels[1]
 
     def interpolate_to_pixels(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Values (samples, beams) at the pixels (rows, columns), linear in between."""
+        """Interpolate values (samples, beams) at the pixels (rows, columns)."""
         rows, columns = self._shape
         if self._maps is None:
             resized: Any = cv2.resize(values, self.room[::-1], interpolation=cv2.INTER_LINEAR)
@@ -240,7 +243,7 @@ def _nearest(marked: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 
 def compute_aperture(probe: Probe, depth: NDArray[Any]) -> NDArray[np.float64]:
-    """(D,) m, of the face that forms an echo at depths (D,) m: as long as keeps the f-number."""
+    """Return (D,) m, the length of face that keeps the f-number at depths (D,) m."""
     starts = probe.compute_rays(np.array([0.0, 1.0]))[0]
     length = float(np.linalg.norm(starts[1] - starts[0]))
     length = max(length, getattr(probe, "aperture", 0.0))  # a phased array uses all of its face

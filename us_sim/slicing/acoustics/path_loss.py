@@ -63,7 +63,7 @@ class Crossings(NamedTuple):
 
 
 def allocate_crossings(count: int) -> Crossings:
-    """Room for so many."""
+    """Allocate arrays for ``count`` crossings."""
     return Crossings(
         np.empty(count, np.int32), np.empty(count, np.float32), np.empty((count, 2), np.uint8),
         np.empty(count, np.int32), np.empty((count, 3), np.float32),
@@ -72,44 +72,45 @@ def allocate_crossings(count: int) -> Crossings:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def trace_beams(
+def trace_beams(  # noqa: PLR0913
     elements, wide, steps, maps, voxels, shape, places, lines, across, along, media, time_gain,
     fibre, gain, blocked, blocker, crossings,
 ):  # fmt: skip
-    """Fills gain, blocked and blocker; returns the numbers of crossings and of clear samples.
+    """Fill gain, blocked and blocker; return the numbers of crossings and of clear samples.
 
     Args:
-        elements: (pixels,) as `Located.elements`, flat, ``wide`` a row, every ``steps`` (2,) rows
-            and columns; maps: as there. voxels: (I*J*K,) uint8 labels, shape: (3,) its sides.
+        elements: (pixels,) as `LocatedPixels.elements`, flat.
+        wide: elements a row.
+        steps: (2,) rows and columns of the image from one element to the next.
+        maps: as `LocatedPixels.maps`.
+        voxels: (I*J*K,) uint8 labels.
+        shape: (3,) I, J, K.
         places: (beams, samples) int32, of the element at each sample.
         lines: (beams, 4) column and row of the first sample, and from each to the next.
-        across, along: (beams,) float32, the beams' directions as x and z.
+        across: (beams,) float32, x of the beams' directions.
+        along: (beams,) float32, z of the beams' directions.
+        media: `Media`.
         time_gain: (samples,) float32 dB.
         fibre: (E + 1, directions, 2) float32, x and z of the unit fibres of each map.
         gain: (samples, beams) float32 dB, all but what blocks.
-        blocked, blocker: (samples, beams) float32 dB lost to what blocks, and the mean sample at
-            which it is lost.
+        blocked: (samples, beams) float32 dB lost to what blocks.
+        blocker: (samples, beams) float32, mean sample at which that is lost.
+        crossings: `Crossings`.
     """
     beams, samples = places.shape
-    room = len(crossings.beam)
     found = 0
     first_blocked = samples
-    half = np.float32(0.5)
     nothing = np.float32(0.0)
     of_label = media.of_label
     sides = (shape[0], shape[1], shape[2])
-    bx = by = bz = np.int64(0)
     for k in range(beams):
         soft = nothing
         hard = nothing
         where = nothing
         was = np.uint8(NOTHING)
-        px = py = pz = np.int64(0)
         x = y = z = np.int64(0)
         gx = gy = gz = np.int64(0)
-        column, row = lines[k, 0], lines[k, 1]
-        to_column = lines[k, 2]
-        to_row = lines[k, 3]
+        line = (lines[k, 0], lines[k, 1], lines[k, 2], lines[k, 3])
         held = np.int32(-2)  # the element whose gradient is gx, gy, gz
         for s in range(samples):
             element = elements[np.uint64(places[k, s])]
@@ -122,113 +123,26 @@ def trace_beams(
                     z += gz
                 else:
                     m = maps[np.uint64(element)]
-                    c = column + s * to_column
-                    r = row + s * to_row
-                    x = _fixed(m[0, 0] + m[0, 1] * c + m[0, 2] * r + _HALF)
-                    y = _fixed(m[1, 0] + m[1, 1] * c + m[1, 2] * r + _HALF)
-                    z = _fixed(m[2, 0] + m[2, 1] * c + m[2, 2] * r + _HALF)
-                    gx = _fixed(m[0, 1] * to_column + m[0, 2] * to_row)
-                    gy = _fixed(m[1, 1] * to_column + m[1, 2] * to_row)
-                    gz = _fixed(m[2, 1] * to_column + m[2, 2] * to_row)
+                    x, y, z = _locate_voxel(m, line, s)
+                    gx = _fixed(m[0, 1] * line[2] + m[0, 2] * line[3])
+                    gy = _fixed(m[1, 1] * line[2] + m[1, 2] * line[3])
+                    gz = _fixed(m[2, 1] * line[2] + m[2, 2] * line[3])
                 medium = _medium_in(x, y, z, voxels, sides, of_label)
-            legs = 1
-            changes = element != held and element >= 0 and held >= 0 and was != NOTHING
-            far = max(max(abs(x - px), abs(y - py)), abs(z - pz)) >= _LEAP
-            # Another tetrahedron is squeezed otherwise, which matters where a border may be.
-            if changes and (far or medium != was):
-                legs = _LEGS
+            is_far = max(max(abs(x - px), abs(y - py)), abs(z - pz)) >= _LEAP
+            if medium == was and not is_far:
+                length = np.float32(0.5) if s == 0 else np.float32(1.0)
+                soft += length * media.loss[medium]
+                if media.blocks[medium]:
+                    hard, where = _block(length * media.shadow[medium], s, hard, where)
+            else:
+                # Another tetrahedron is squeezed otherwise, which matters where a border may be.
+                changes = element != held and element >= 0 and held >= 0 and was != NOTHING
+                soft, hard, where, was, found = _follow_step(
+                    k, s, _LEGS if changes else 1, (px, py, pz), (x, y, z), element, was, medium,
+                    soft, hard, where, line, elements, wide, steps, maps, voxels, sides, media,
+                    time_gain[s], crossings, found,
+                )  # fmt: skip
             held = element
-            for leg in range(1, legs + 1):
-                ex, ey, ez, inner, next_medium = x, y, z, element, medium
-                begin = np.float32(s - 1 + (leg - 1) / legs)
-                if leg < legs:
-                    c = column + (s - 1 + leg / legs) * to_column
-                    r = row + (s - 1 + leg / legs) * to_row
-                    i = np.int64(r / steps[0] + 0.5) * wide + np.int64(c / steps[1] + 0.5)
-                    inner = elements[min(max(i, 0), len(elements) - 1)]
-                    if inner < 0:
-                        inner = element
-                    m = maps[np.uint64(inner)]
-                    ex = _fixed(m[0, 0] + m[0, 1] * c + m[0, 2] * r + _HALF)
-                    ey = _fixed(m[1, 0] + m[1, 1] * c + m[1, 2] * r + _HALF)
-                    ez = _fixed(m[2, 0] + m[2, 1] * c + m[2, 2] * r + _HALF)
-                    next_medium = _medium_in(ex, ey, ez, voxels, sides, of_label)
-                # Where tissue is squeezed there is more of it between two samples.
-                parts = np.int64(1)
-                if element >= 0 and was != NOTHING:
-                    apart = max(max(abs(ex - px), abs(ey - py)), abs(ez - pz)) >> _BITS
-                    parts = np.int64(min(int(1 + apart // _CLOSE), _MOST_PARTS))
-                length = half if s == 0 else np.float32(1.0 / (legs * parts))
-                lx, ly, lz = px, py, pz
-                for q in range(1, parts + 1):
-                    nx, ny, nz, now = ex, ey, ez, next_medium
-                    if q < parts:
-                        nx, ny, nz = (
-                            px + (ex - px) * q // parts,
-                            py + (ey - py) * q // parts,
-                            pz + (ez - pz) * q // parts,
-                        )
-                        now = _medium_in(nx, ny, nz, voxels, sides, of_label)
-                    if now == was:
-                        soft += length * media.loss[now]
-                        if media.blocks[now]:
-                            loss = length * media.shadow[now]
-                            where = _blocked_at(where, hard, loss, s)
-                            hard += loss
-                    else:
-                        high = 1.0
-                        if s == 0:
-                            high = 0.0
-                        elif was != NOTHING and now != NOTHING:
-                            part = 1.0
-                            ax, ay, az = lx, ly, lz  # still before the border
-                            bx, by, bz = nx, ny, nz  # behind it
-                            for _ in range(_HALVINGS):
-                                part *= 0.5
-                                cx, cy, cz = (ax + bx) >> 1, (ay + by) >> 1, (az + bz) >> 1
-                                if _medium_in(cx, cy, cz, voxels, sides, of_label) == was:
-                                    ax, ay, az = cx, cy, cz
-                                else:
-                                    bx, by, bz = cx, cy, cz
-                                    high -= part
-                            high -= 0.5 * part
-                        else:
-                            high = 0.5
-                        t = np.float32(high) * length
-                        rest = length - t
-                        border = media.crossing[was, now]
-                        soft += t * media.loss[was]
-                        if media.blocks[was]:
-                            loss = t * media.shadow[was]
-                            where = _blocked_at(where, hard, loss, s)
-                            hard += loss
-                        if was != NOTHING and now != NOTHING and found < room:
-                            crossings.beam[found] = k
-                            crossings.distance[found] = begin + (q - 1) * length + t
-                            crossings.media[found, 0] = was
-                            crossings.media[found, 1] = now
-                            crossings.element[found] = inner
-                            crossings.voxel[found, 0] = bx * _UNIT - _HALF
-                            crossings.voxel[found, 1] = by * _UNIT - _HALF
-                            crossings.voxel[found, 2] = bz * _UNIT - _HALF
-                            crossings.slope[found, 0] = (ex - px) * legs * _UNIT
-                            crossings.slope[found, 1] = (ey - py) * legs * _UNIT
-                            crossings.slope[found, 2] = (ez - pz) * legs * _UNIT
-                            crossings.level[found] = time_gain[s] - soft - hard
-                            found += 1
-                        if media.blocks[was] or media.blocks[now]:
-                            where = _blocked_at(where, hard, border, s)
-                            hard += border
-                        else:
-                            soft += border
-                        soft += rest * media.loss[now]
-                        if media.blocks[now]:
-                            loss = rest * media.shadow[now]
-                            where = _blocked_at(where, hard, loss, s)
-                            hard += loss
-                        was = now
-                    lx, ly, lz = nx, ny, nz
-                px, py, pz = ex, ey, ez
             level = time_gain[s] - soft + media.scattering[medium]
             direction = media.fibres[medium]
             if direction >= 0:
@@ -246,9 +160,143 @@ def trace_beams(
     return found, first_blocked
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _follow_step(  # noqa: PLR0913
+    k, s, legs, before, behind, element, was, last_medium, soft, hard, where, line, elements, wide,
+    steps, maps, voxels, sides, media, time_gain, crossings, found,
+):  # fmt: skip
+    """Follow beam ``k`` from sample ``s - 1`` to ``s``, where it may meet borders.
+
+    Shapes and units:
+        legs: parts of the way, each in the map of the element at its end.
+        before, behind: the two samples, fixed-point voxel coordinates.
+
+    Returns:
+        soft and hard loss, the mean sample of the latter, the last medium, number of crossings.
+    """
+    of_label = media.of_label
+    px, py, pz = before
+    for leg in range(1, legs + 1):
+        ex, ey, ez = behind
+        inner, next_medium = element, last_medium
+        if leg < legs:
+            at = s - 1 + leg / legs
+            inner = _find_element(elements, wide, steps, line, at, element)
+            ex, ey, ez = _locate_voxel(maps[np.uint64(inner)], line, at)
+            next_medium = _medium_in(ex, ey, ez, voxels, sides, of_label)
+        # Where tissue is squeezed there is more of it between two samples.
+        parts = np.int64(1)
+        if element >= 0 and was != NOTHING:
+            apart = max(max(abs(ex - px), abs(ey - py)), abs(ez - pz)) >> _BITS
+            parts = np.int64(min(int(1 + apart // _CLOSE), _MOST_PARTS))
+        length = np.float32(0.5) if s == 0 else np.float32(1.0 / (legs * parts))
+        begin = np.float32(s - 1 + (leg - 1) / legs)
+        lx, ly, lz = px, py, pz
+        for q in range(1, parts + 1):
+            nx, ny, nz, now = ex, ey, ez, next_medium
+            if q < parts:
+                nx = px + (ex - px) * q // parts
+                ny = py + (ey - py) * q // parts
+                nz = pz + (ez - pz) * q // parts
+                now = _medium_in(nx, ny, nz, voxels, sides, of_label)
+            t = length
+            if now != was:
+                high, bx, by, bz = _find_border(
+                    lx, ly, lz, nx, ny, nz, s, was, now, voxels, sides, of_label
+                )
+                t = np.float32(high) * length
+            soft += t * media.loss[was]
+            if media.blocks[was]:
+                hard, where = _block(t * media.shadow[was], s, hard, where)
+            if now != was:
+                if was != NOTHING and now != NOTHING and found < len(crossings.beam):
+                    crossings.beam[found] = k
+                    crossings.distance[found] = begin + (q - 1) * length + t
+                    crossings.media[found, 0] = was
+                    crossings.media[found, 1] = now
+                    crossings.element[found] = inner
+                    crossings.voxel[found, 0] = bx * _UNIT - _HALF
+                    crossings.voxel[found, 1] = by * _UNIT - _HALF
+                    crossings.voxel[found, 2] = bz * _UNIT - _HALF
+                    crossings.slope[found, 0] = (ex - px) * legs * _UNIT
+                    crossings.slope[found, 1] = (ey - py) * legs * _UNIT
+                    crossings.slope[found, 2] = (ez - pz) * legs * _UNIT
+                    crossings.level[found] = time_gain - soft - hard
+                    found += 1
+                soft, hard, where = _pass_border(
+                    media.crossing[was, now], length - t, s, media.blocks[was],
+                    media.blocks[now], media.loss[now], media.shadow[now], soft, hard, where,
+                )  # fmt: skip
+                was = now
+            lx, ly, lz = nx, ny, nz
+        px, py, pz = ex, ey, ez
+    return soft, hard, where, was, found
+
+
+@njit(inline="always", error_model="numpy")
+def _pass_border(  # noqa: PLR0913
+    border, rest, s, was_blocker, is_blocker, loss, shadow, soft, hard, where
+):
+    """Add what a border takes (dB), and the way behind it, ``rest`` samples."""
+    if was_blocker or is_blocker:
+        hard, where = _block(border, s, hard, where)
+    else:
+        soft += border
+    soft += rest * loss
+    if is_blocker:
+        hard, where = _block(rest * shadow, s, hard, where)
+    return soft, hard, where
+
+
+@njit(inline="always", error_model="numpy")
+def _locate_voxel(m, line, at):
+    """Map a place on a beam, in samples from its first, to fixed-point voxel coordinates."""
+    c = line[0] + at * line[2]
+    r = line[1] + at * line[3]
+    return (
+        _fixed(m[0, 0] + m[0, 1] * c + m[0, 2] * r + _HALF),
+        _fixed(m[1, 0] + m[1, 1] * c + m[1, 2] * r + _HALF),
+        _fixed(m[2, 0] + m[2, 1] * c + m[2, 2] * r + _HALF),
+    )
+
+
+@njit(inline="always", error_model="numpy")
+def _find_element(elements, wide, steps, line, at, instead):
+    """Return the element at a place on a beam; ``instead`` where nothing is shown there."""
+    c = line[0] + at * line[2]
+    r = line[1] + at * line[3]
+    i = np.int64(r / steps[0] + 0.5) * wide + np.int64(c / steps[1] + 0.5)
+    element = elements[min(max(i, 0), len(elements) - 1)]
+    return element if element >= 0 else instead
+
+
+@njit(inline="always", error_model="numpy")
+def _find_border(ax, ay, az, bx, by, bz, s, was, now, voxels, sides, of_label):  # noqa: PLR0913
+    """Halve the way between two media; return the part before the border, and a place behind it."""
+    if s == 0 or was == NOTHING or now == NOTHING:
+        return 0.0 if s == 0 else 0.5, bx, by, bz
+    high = 1.0
+    part = 1.0
+    for _ in range(_HALVINGS):
+        part *= 0.5
+        cx, cy, cz = (ax + bx) >> 1, (ay + by) >> 1, (az + bz) >> 1
+        if _medium_in(cx, cy, cz, voxels, sides, of_label) == was:
+            ax, ay, az = cx, cy, cz
+        else:
+            bx, by, bz = cx, cy, cz
+            high -= part
+    return high - 0.5 * part, bx, by, bz
+
+
+@njit(inline="always", error_model="numpy")
+def _block(loss, s, hard, where):
+    """Add a loss at sample ``s`` to the hard loss and to the mean sample of that."""
+    return hard + loss, _blocked_at(where, hard, loss, s)
+
+
 @njit(inline="always", error_model="numpy")
 def _blocked_at(where, hard, loss, s):
-    """The mean sample where a beam is blocked, with a further loss at sample ``s``."""
+    """Return the mean sample where a beam is blocked, with a further loss at sample ``s``."""
     if hard < np.float32(_DARK) and loss > np.float32(0.0):
         return np.float32((where * hard + loss * s) / (hard + loss))
     return where
@@ -262,7 +310,7 @@ def _fixed(value):
 
 @njit(inline="always", error_model="numpy")
 def _medium_in(x, y, z, voxels, sides, of_label):
-    """The medium of the voxel that fixed-point coordinates lie in, `NOTHING` beyond the volume."""
+    """Return the medium at fixed-point coordinates, `NOTHING` beyond the volume."""
     ix, iy, iz = x >> _BITS, y >> _BITS, z >> _BITS
     # Negative ones are very large without a sign.
     is_inside = np.uint64(ix) < np.uint64(sides[0])
@@ -275,9 +323,9 @@ def _medium_in(x, y, z, voxels, sides, of_label):
 
 @njit(inline="always", error_model="numpy")
 def find_medium(x, y, z, voxels, sides, ends, of_label):
-    """The medium at a voxel index: of the nearest voxel, `NOTHING` beyond the volume.
+    """Return the medium of the voxel nearest to an index, `NOTHING` beyond the volume.
 
-    Args:
+    Shapes and units:
         sides: of the volume, three int64. ends: where its last voxels end, three float64.
     """
     # Without `and`, whose branches would take longer than the comparisons.
@@ -295,12 +343,12 @@ def find_medium(x, y, z, voxels, sides, ends, of_label):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def sharpen_borders(found, crossings, gain, blocked, media, rise, steps, pixels):
-    """Sets the gain of pixels between the two samples around a border as if on its beam alone.
+    """Set the gain of pixels between the two samples around a border as if on its beam alone.
 
     Between samples a gain is interpolated, which would smear what a border takes and where another
     tissue begins.
 
-    Args:
+    Shapes and units:
         gain, blocked: (samples, beams) dB. rise: dB, of the time gain in a sample's length.
         steps: (2,) rows a sample and columns a beam. pixels: (rows, columns) float32 dB, changed.
     """
@@ -343,10 +391,10 @@ AMPLITUDES = (10.0 ** (-np.arange(100 * _FINE + 2) / (20.0 * _FINE))).astype(np.
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def cast_shadows(first, beams, blocked, blocker, distance, aperture, spacing, amplitudes, gain):
+def cast_shadows(first, beams, blocked, blocker, distance, aperture, spacing, amplitudes, gain):  # noqa: PLR0913
     """Subtract the shadows of blockers from the gain, with soft edges, from sample ``first`` on.
 
-    Args:
+    Shapes and units:
         beams: how many there are; the arrays may have room for more.
         blocked: (samples, beams) float32 dB, blocker: the sample where it is lost.
         distance: (samples,) m. aperture: (samples,) m. spacing: (samples,) m between beams.
@@ -402,7 +450,7 @@ def cast_shadows(first, beams, blocked, blocker, distance, aperture, spacing, am
 
 @njit(inline="always", error_model="numpy")
 def _mean(total, low, high, count):
-    """The mean between two places, from the cumulative sums ``total`` (count + 1,).
+    """Return the mean between two places, from the cumulative sums ``total`` (count + 1,).
 
     Beyond its ends the outermost values go on, so that an edge near them stays where it is.
     """
@@ -414,7 +462,7 @@ def _mean(total, low, high, count):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sharpen_edges(
+def sharpen_edges(  # noqa: PLR0913
     elements, wide, steps, maps, voxels, shape, lines, media, samples, beams, blocked, blocker
 ):
     """Move the edges of blockers from halfway between two beams to their true places.
@@ -422,7 +470,7 @@ def sharpen_edges(
     Between a beam that is blocked and one that is not, further beams are followed, in finer steps;
     the part of a beam's width that is not blocked then lets that much through.
 
-    Args:
+    Shapes and units:
         elements: (pixels,) flat, ``wide`` a row, every ``steps`` (2,) rows and columns.
         maps, voxels, shape, lines, media: as for `path_loss.trace_beams`.
         blocked, blocker: (samples, beams) float32, changed.
@@ -435,26 +483,36 @@ def sharpen_edges(
                 continue
             if blocked[last, k] > _HALF_AMPLITUDE or blocked[last, dark] <= _HALF_AMPLITUDE:
                 continue
-            low = 0.0  # beams from the lit one towards the dark one
-            high = 1.0
-            if _is_blocked(k, 0.0, dark, elements, wide, steps, maps, voxels, shape, lines, media,
-                           samples):  # fmt: skip
-                # Its samples missed a corner.
-                low, high = -1.0, 0.0
-            for _ in range(_EDGE_HALVINGS):
-                middle = 0.5 * (low + high)
-                if _is_blocked(k, middle, dark, elements, wide, steps, maps, voxels, shape, lines,
-                               media, samples):  # fmt: skip
-                    high = middle
-                else:
-                    low = middle
-            edge = 0.5 * (low + high)
+            edge = _find_edge(
+                k, dark, elements, wide, steps, maps, voxels, shape, lines, media, samples
+            )
             # Each beam stands for half a beam to either side of it.
             for one, lit in ((k - side, edge + 1.5), (k, edge + 0.5), (dark, edge - 0.5)):
                 if 0 <= one < beams and 0.0 < lit < 1.0:
                     _let_through(samples, one, dark, lit, blocked, blocker)
                 elif 0 <= one < beams and lit <= 0.0 and one != dark:
                     _let_through(samples, one, dark, 0.0, blocked, blocker)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _find_edge(  # noqa: PLR0913
+    k, dark, elements, wide, steps, maps, voxels, shape, lines, media, samples
+):
+    """Find the edge of a blocker, in beams from beam ``k``, which is lit, towards the dark one."""
+    low = 0.0
+    high = 1.0
+    if _is_blocked(k, 0.0, dark, elements, wide, steps, maps, voxels, shape, lines, media, samples):
+        # Its samples missed a corner.
+        low, high = -1.0, 0.0
+    for _ in range(_EDGE_HALVINGS):
+        middle = 0.5 * (low + high)
+        if _is_blocked(
+            k, middle, dark, elements, wide, steps, maps, voxels, shape, lines, media, samples
+        ):
+            high = middle
+        else:
+            low = middle
+    return 0.5 * (low + high)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -469,8 +527,8 @@ def _let_through(samples, one, dark, lit, blocked, blocker):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _is_blocked(k, part, dark, elements, wide, steps, maps, voxels, shape, lines, media, samples):
-    """Whether the beam between two, so many parts from the first, loses half its amplitude."""
+def _is_blocked(k, part, dark, elements, wide, steps, maps, voxels, shape, lines, media, samples):  # noqa: PLR0913
+    """Return True if the beam at a part of the way from beam ``k`` loses half its amplitude."""
     first = lines[k] + part * (lines[dark] - lines[k])
     sides = (shape[0], shape[1], shape[2])
     ends = (sides[0] + END, sides[1] + END, sides[2] + END)

@@ -44,7 +44,7 @@ _TABLE = {
 
 
 def find_table_constants(name: str) -> tuple[float, float] | None:
-    """Attenuation (dB/cm/MHz) and impedance (Rayl) of the tissue that a label names.
+    """Return attenuation (dB/cm/MHz) and impedance (Rayl) of the tissue that a label names.
 
     Of several known words in a name the last one counts; None where there is none. Attenuation is
     taken as proportional to the frequency: the source's coefficient at 1 MHz.
@@ -100,17 +100,17 @@ class TissueAcoustics(Settings):
     )
 
     def check(self) -> None:
-        """Fibres have a direction, if any."""
+        """Refuse fibres without a direction."""
         if self.fibres is not None and not any(self.fibres):
             raise self.make_error("fibres", "0, 0, 0 is no direction: leave it out for none")
 
     @property
     def has_fibres(self) -> bool:
-        """Whether its echoes depend on a direction."""
+        """True if its echoes depend on a direction."""
         return self.fibres is not None and self.anisotropy > 0.0
 
     def fill_from_table(self, name: str) -> TissueAcoustics:
-        """With the textbook's constants of a label's name where none are given.
+        """Fill in the textbook's constants of a label's name where none are given.
 
         Raises:
             ProbeError: the textbook has none for that name; ``key`` says which.
@@ -177,11 +177,11 @@ class SoundSettings(Settings):
 
     @property
     def is_live(self) -> bool:
-        """Whether artefacts are made along the beams."""
+        """True if artefacts are made along the beams."""
         return self.artefacts == "live"
 
     def choose_frequency(self, frequencies: tuple[float, float]) -> float:
-        """Hz: the frequency that is set, or the middle of those that a probe has.
+        """Return the frequency (Hz) that is set, or the middle of those that a probe has.
 
         Raises:
             ProbeError: the probe cannot have it.
@@ -207,7 +207,7 @@ class Acoustics(SoundSettings):
     )
 
     def get_constants(self, name: str) -> TissueAcoustics:
-        """The constants of the tissue with a label of that name.
+        """Return the constants of the tissue with a label of that name.
 
         Raises:
             ProbeError: it has none.

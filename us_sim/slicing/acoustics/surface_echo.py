@@ -34,7 +34,7 @@ _FLAT = 1e-30
 
 
 def compute_angle_loss(cosine: Any) -> Any:
-    """dB by which a border is fainter, seen at an angle with that cosine (any shape)."""
+    """Return the dB by which a border is fainter, seen at an angle with that cosine (any shape)."""
     square = np.maximum(np.square(cosine), 1e-6)
     facets = np.exp(-(1.0 - square) / square / (2.0 * ROUGHNESS**2))
     floor = 10.0 ** (_DIFFUSE / 20.0) * np.sqrt(square)
@@ -42,7 +42,7 @@ def compute_angle_loss(cosine: Any) -> Any:
 
 
 def _grain() -> np.ndarray:
-    """(16, 16, 16) float32 dB: borders are patchy, as the tissue at them is."""
+    """Return (16, 16, 16) float32 dB: borders are patchy, as the tissue at them is."""
     random = np.random.Generator(np.random.PCG64(11))
     noise = random.standard_normal((_GRAIN_SIDE,) * 3) + 1j * random.standard_normal(
         (_GRAIN_SIDE,) * 3
@@ -63,14 +63,14 @@ GRAIN = _grain()
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def draw_surfaces(
+def draw_surfaces(  # noqa: PLR0913
     found, crossings, surface, normals, blocks, shape, rest_index, tetrahedra, corners,
     nodes, rigid, beam_axes, step, spacing, starts, directions, across, down, to_pixel, pulse,
     greys, angles, grain, runs, image,
 ):  # fmt: skip
-    """Draws the echoes of the first ``found`` crossings where they are brighter than the image.
+    """Draw the echoes of the first ``found`` crossings where they are brighter than the image.
 
-    Args:
+    Shapes and units:
         crossings: as `path_loss.Crossings`.
         surface: (media, media) float32 dB, of a border at a right angle.
         normals, blocks: as `SurfaceNormals`. shape: (3,) of the volume.
@@ -146,37 +146,54 @@ def draw_surfaces(
         left, right = _within(
             to_pixel[0] + (x - wide) / across, to_pixel[0] + (x + wide) / across, columns
         )
-        # How far a pixel in row 0 is along the beam from the border's tangent, and by row.
-        by_row = nz * down / slope
-        grey = level * greys + 255.5
         fading = 6.0206 * 4.0 / (pulse * pulse) * greys  # 6 dB at half the pulse's length
-        for column in range(left, right):
-            qx = (column - to_pixel[0]) * across - x
-            start = (nx * qx - nz * (to_pixel[1] * down + z)) / slope
-            lateral = qx * dz + (to_pixel[1] * down + z) * dx
-            upper, lower = top, bottom
-            if by_row > _STEEPEST * down:
-                upper, lower = _within(
-                    (-longest - start) / by_row, (longest - start) / by_row, rows
+        _draw_echo(
+            top, bottom, left, right, nx, nz, slope, dx, dz, x, z, half, longest,
+            level * greys + 255.5, fading, across, down, to_pixel, runs, image,
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _draw_echo(  # noqa: PLR0913
+    top, bottom, left, right, nx, nz, slope, dx, dz, x, z, half, longest, grey, fading, across,
+    down, to_pixel, runs, image,
+):  # fmt: skip
+    """Draw a border's echo into a box of pixels, where it is brighter than the image.
+
+    Shapes and units:
+        nx, nz: the border's normal; slope: its component along the beam, dx, dz.
+        x, z: m, where the beam meets the border.
+        half, longest: m, half of the beam's width, and what is drawn along it on either side.
+        grey, fading: grey value at the border, and its fall over the distance squared, 1/m².
+    """
+    rows = image.shape[0]
+    # How far a pixel in row 0 is along the beam from the border's tangent, and by row.
+    by_row = nz * down / slope
+    for column in range(left, right):
+        qx = (column - to_pixel[0]) * across - x
+        start = (nx * qx - nz * (to_pixel[1] * down + z)) / slope
+        lateral = qx * dz + (to_pixel[1] * down + z) * dx
+        upper, lower = top, bottom
+        if by_row > _STEEPEST * down:
+            upper, lower = _within((-longest - start) / by_row, (longest - start) / by_row, rows)
+            upper, lower = max(upper, top), min(lower, bottom)
+        for row in range(upper, lower):
+            t = start + row * by_row
+            shown = grey - fading * t * t
+            if (
+                shown > image[row, column] + 0.5
+                and abs(lateral - row * down * dx) <= half
+                and (
+                    runs[row, 0, 0] <= column < runs[row, 0, 1]
+                    or runs[row, 1, 0] <= column < runs[row, 1, 1]
                 )
-                upper, lower = max(upper, top), min(lower, bottom)
-            for row in range(upper, lower):
-                t = start + row * by_row
-                shown = grey - fading * t * t
-                if (
-                    shown > image[row, column] + 0.5
-                    and abs(lateral - row * down * dx) <= half
-                    and (
-                        runs[row, 0, 0] <= column < runs[row, 0, 1]
-                        or runs[row, 1, 0] <= column < runs[row, 1, 1]
-                    )
-                ):
-                    image[row, column] = 255 if shown > 255.0 else int(shown)
+            ):
+                image[row, column] = 255 if shown > 255.0 else int(shown)
 
 
 @njit(inline="always", error_model="numpy")
 def _within(low, high, count):
-    """First and end of the whole numbers from one place to another, of 0 to ``count - 1``."""
+    """Return first and end of the whole numbers between two places, of 0 to ``count - 1``."""
     first = int(np.ceil(low))
     end = int(np.floor(high)) + 1
     return first if first > 0 else 0, end if end < count else count
@@ -184,7 +201,7 @@ def _within(low, high, count):
 
 @njit(inline="always", error_model="numpy")
 def _carry_normal(normal, element, rest_index, tetrahedra, corners, nodes, rigid, out):
-    """The covector of voxel indices as one of the patient now; whether there is one.
+    """Carry the covector of voxel indices into the patient; return False where there is none.
 
     The edges d of a tetrahedron now, and e of it at rest in voxels, fulfil c · d = normal · e.
     """
@@ -248,7 +265,7 @@ class SurfaceNormals:
         _fill_normals(flat, shape, weights, _DISTANCES, self.blocks, self.normals)
 
     def get_normal(self, i: int, j: int, k: int) -> tuple[NDArray[np.float64], float]:
-        """(3,) into the voxel's own label, of length 1, and how many voxels away the surface is.
+        """Return the unit normal (3,) into the voxel's own label, and the voxels to the surface.
 
         Zeros where there is no surface.
         """
@@ -261,7 +278,7 @@ class SurfaceNormals:
 
 
 def _distances() -> NDArray[np.int8]:
-    """(`_PARTS`,) how far a plane is in `DISTANCE`-ths of a voxel, by the part on this side."""
+    """Return (`_PARTS`,) distances of a plane, `DISTANCE`-ths of a voxel, by the part this side."""
     part = (np.arange(_PARTS) + 0.5) / _PARTS
     # A Gaussian that ends at the reach, of voxels: as the mean of a half space's would be.
     offset = np.arange(-_REACH, _REACH + 1)
@@ -279,7 +296,7 @@ _found: WeakValueDictionary[tuple[int, tuple[int, ...]], SurfaceNormals] = WeakV
 
 
 def find_surface_normals(volume: Volume) -> SurfaceNormals:
-    """The normals of a volume's labels, found when they are first asked for (about a second).
+    """Return the normals of a volume's labels, found on first use (about a second).
 
     They are kept while somebody uses them, also for a volume of the same labels in another place.
     """
@@ -309,7 +326,7 @@ def _beside_another(labels, shape, i, j, k):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _touches_another(labels, shape, i, j, k):
-    """Whether a voxel has another label than one that it shares a face, edge or corner with.
+    """Return True if a voxel shares a face, edge or corner with one of another label.
 
     A beam may pass from voxel to voxel through any of these.
     """
@@ -325,7 +342,7 @@ def _touches_another(labels, shape, i, j, k):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _mark_blocks(labels, shape, blocks):
-    """Numbers the blocks that have a surface; returns how many there are."""
+    """Give numbers to the blocks that have a surface; return how many there are."""
     count = 0
     for a in range(blocks.shape[0]):
         for b in range(blocks.shape[1]):

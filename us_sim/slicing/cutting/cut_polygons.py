@@ -49,7 +49,7 @@ class Cuts(NamedTuple):
 
 
 def allocate_cuts(count: int) -> Cuts:
-    """Room for the cuts of that many tetrahedra, even if all are inverted."""
+    """Allocate arrays for the cuts of ``count`` tetrahedra, even if all are inverted."""
     many = 4 * count + 1  # one more for the rigid map
     return Cuts(
         np.empty((many, 3, 3)),
@@ -64,16 +64,16 @@ def allocate_cuts(count: int) -> Cuts:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def cut_tetrahedra(
+def cut_tetrahedra(  # noqa: PLR0913
     near, nodes, to_pixel, pixel_volume, columns, rows, tetrahedra, neighbours, determinants,
     rest_index, within, cuts,
 ):  # fmt: skip
-    """Fills ``cuts``; returns the numbers of cuts, of outlines and of tetrahedra skipped.
+    """Fill ``cuts``; return the numbers of cuts, of outlines and of tetrahedra skipped.
 
     The fourth number says whether the cuts are sure to cover the image: no outline is on it, but
     a corner of a polygon is.
 
-    Args:
+    Shapes and units:
         near: (K,) tetrahedra to cut. nodes: (N, 3) m. to_pixel: (3, 4) from m to column, row and
             height. pixel_volume: m³ per unit of those.
         neighbours: (M, 4) the tetrahedron beyond each face, -1 where the mesh ends.
@@ -124,7 +124,7 @@ def cut_tetrahedra(
 
 @njit(inline="always", error_model="numpy")
 def place_node(nodes, n, to_pixel, place, k):
-    """Column, row and height of node ``n``, into row ``k`` of ``place`` (…, 3)."""
+    """Write column, row and height of node ``n`` into row ``k`` of ``place`` (…, 3)."""
     x, y, z = nodes[n, 0], nodes[n, 1], nodes[n, 2]
     for a in range(3):
         place[k, a] = to_pixel[a, 3] + to_pixel[a, 0] * x + to_pixel[a, 1] * y + to_pixel[a, 2] * z
@@ -134,7 +134,7 @@ def place_node(nodes, n, to_pixel, place, k):
 
 @njit(inline="always", error_model="numpy")
 def cross_edge(place, a, b, corner):
-    """Where the edge from a node above (or on) the plane to one below it crosses the plane."""
+    """Write the point where an edge from above (or on) the plane to below crosses it."""
     t = place[a, 2] / (place[a, 2] - place[b, 2])
     corner[0] = place[a, 0] + t * (place[b, 0] - place[a, 0])
     corner[1] = place[a, 1] + t * (place[b, 1] - place[a, 1])
@@ -142,7 +142,7 @@ def cross_edge(place, a, b, corner):
 
 @njit(inline="always", error_model="numpy")
 def _cross(place, order, polygon):
-    """Fills the corners of the polygon, in turn; returns how many there are."""
+    """Fill the corners of the polygon, in turn; return how many there are."""
     # Nodes above the plane come first, then those below it.
     up = np.uint64(0)
     for k in range(4):
@@ -199,7 +199,7 @@ def _is_on_image(place, polygon, sides, columns, rows):
 
 @njit(inline="always", error_model="numpy")
 def _map_to_rest(place, corners, pixel_volume, rest_determinant, rest_index, form):
-    """Fills the (3, 3) map of a tetrahedron; returns whether it is neither inverted nor flat."""
+    """Fill the (3, 3) map of a tetrahedron; return False if it is inverted or flat."""
     determinant, to_1, to_2, to_3 = compute_adjugate(place, 0, 1, 2, 3)
     if not is_solid(determinant, pixel_volume, rest_determinant):
         return False
@@ -220,7 +220,7 @@ def _map_to_rest(place, corners, pixel_volume, rest_determinant, rest_index, for
 
 @njit(inline="always", error_model="numpy")
 def _is_gentle(form):
-    """Whether rounding of a pixel's place cannot lead out of the tetrahedron's surroundings."""
+    """Return True if rounding of a pixel's place cannot lead far out of the tetrahedron."""
     steepest = 0.0
     for a in range(3):
         steepest = max(steepest, max(abs(form[a, 1]), abs(form[a, 2])))
@@ -229,7 +229,7 @@ def _is_gentle(form):
 
 @njit(inline="always", error_model="numpy")
 def cut_face(place, a, b, c, points):
-    """Fills the points that span the closed cut of a face; returns how many of three there are."""
+    """Fill the points that span the closed cut of a face; return how many of three there are."""
     count = 0
     for k in (a, b, c):
         if place[k, 2] == 0.0:
@@ -258,11 +258,11 @@ def _close_face(place, f, columns, rows, cuts, pieces, count):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _close_around(
+def _close_around(  # noqa: PLR0913
     skipped, place, nodes, to_pixel, pixel_volume, columns, rows, tetrahedra, neighbours,
     determinants, rest_index, cuts, pieces, count,
 ):  # fmt: skip
-    """The neighbours of a skipped tetrahedron end at it: adds the outlines of their faces."""
+    """Add the outlines of the neighbours of a skipped tetrahedron, which end at it."""
     for e in neighbours[skipped]:
         if e < 0:
             continue
@@ -329,7 +329,7 @@ class RestSurface:
         )
 
     def cut_plane(self, plane: SlicePlane) -> Outline:
-        """The cut by the plane of an image; overwritten by the next."""
+        """Return the cut by the plane of an image; the next call overwrites it."""
         count = _cut(
             self._nodes, self._triangles, plane.to_pixel, plane.columns, plane.rows, self._places,
             *self._outline[:3],
@@ -338,8 +338,8 @@ class RestSurface:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cut(nodes, triangles, to_pixel, columns, rows, place, outlines, points, turns):
-    """Fills an outline and returns how many cuts it has."""
+def _cut(nodes, triangles, to_pixel, columns, rows, place, outlines, points, turns):  # noqa: PLR0913
+    """Fill an outline and return how many cuts it has."""
     for n in range(len(nodes)):
         place_node(nodes, n, to_pixel, place, n)
     count = 0
@@ -370,7 +370,7 @@ def _cut(nodes, triangles, to_pixel, columns, rows, place, outlines, points, tur
 
 @njit(inline="always", error_model="numpy")
 def _turn(place, a, b, c, outline):
-    """How a face that crosses the plane winds around points right of it; nodes on it are above.
+    """Return how a face that crosses the plane winds around points right of it, 1 or -1.
 
     The face's nodes turn counterclockwise as seen from outside the mesh.
     """
@@ -391,9 +391,9 @@ def _turn(place, a, b, c, outline):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def mark_covered(outlines, points, turns, number, row, winding, covered):
-    """Sets which columns of a row lie in the closed mesh at rest.
+    """Mark the columns of a row that lie in the closed mesh at rest.
 
-    Args:
+    Shapes and units:
         outlines, points, turns, number: as `Outline`.
         winding: (columns + 1,) int32 to work in. covered: (columns,) bool.
     """
@@ -427,15 +427,15 @@ _CLOSE = 1e-8  # pixels from an outline within which a place is on it: rounding 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def convert_cuts(
+def convert_cuts(  # noqa: PLR0913
     corners, sides, count, outlines, points, owner, pieces, runs, first_row, end_row, spans, used
 ):  # fmt: skip
-    """Fills the spans of rows ``first_row`` to ``end_row - 1``; returns the most that a row has.
+    """Fill the spans of rows ``first_row`` to ``end_row - 1``; return the most that a row has.
 
     Where that is more than there is room for, the rest is lost. Where spans overlap the later one
     holds.
 
-    Args:
+    Shapes and units:
         corners … pieces: as `cut_polygons.Cuts`, with how many there are.
         runs: (rows, 2, 2) int32, first and end columns that show something.
         spans: (rows, room) int64. used: (rows,) int32, how many of them a row has.
@@ -449,16 +449,9 @@ def convert_cuts(
         columns = max(columns, max(np.int64(runs[row, 0, 1]), np.int64(runs[row, 1, 1])))
         if runs[row, 1, 1] > runs[row, 1, 0]:
             kinds = np.uint64(2)
-    for q in range(pieces):
-        top = np.inf
-        bottom = -np.inf
-        for k in range(points[q]):
-            top = min(top, outlines[q, k, 1])
-            bottom = max(bottom, outlines[q, k, 1])
-        for row in range(ceil_clamped(top - _CLOSE, first_row, end_row),
-                         min(ceil_clamped(bottom + _CLOSE, first_row, end_row) + 1, end_row)):  # fmt: skip
-            first, end = find_closed_columns(outlines[q], points[q], row, columns)
-            _add(owner[q], first, end, row, runs, kinds, spans, used)
+    _add_outlines(
+        outlines, points, owner, pieces, columns, first_row, end_row, runs, kinds, spans, used
+    )
     for q in range(count):
         if sides[q] == 0:
             continue
@@ -489,15 +482,30 @@ def convert_cuts(
         for row in range(above, below):
             line = np.uint64(row - first_row)
             _add(q, low[line], high[line], row, runs, kinds, spans, used)
-    most = 0
-    for row in range(first_row, end_row):
-        most = max(most, used[row])
-    return most
+    return used[first_row:end_row].max()
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_outlines(  # noqa: PLR0913
+    outlines, points, owner, pieces, columns, first_row, end_row, runs, kinds, spans, used
+):
+    """Add the spans of the cuts' closed outlines, arguments as for `convert_cuts`."""
+    for q in range(pieces):
+        top = np.inf
+        bottom = -np.inf
+        for k in range(points[q]):
+            top = min(top, outlines[q, k, 1])
+            bottom = max(bottom, outlines[q, k, 1])
+        above = ceil_clamped(top - _CLOSE, first_row, end_row)
+        below = ceil_clamped(bottom + _CLOSE, first_row, end_row) + 1
+        for row in range(above, min(below, end_row)):
+            first, end = find_closed_columns(outlines[q], points[q], row, columns)
+            _add(owner[q], first, end, row, runs, kinds, spans, used)
 
 
 @njit(inline="always", error_model="numpy")
 def ceil_clamped(value, least, most):
-    """The least whole number not below a value, held between two others; the first if not one."""
+    """Round up to a whole number held between two others; NaN becomes the first."""
     held = value if value > least else np.float64(least)
     held = held if held < most else np.float64(most)
     return np.int64(np.ceil(held))
@@ -518,7 +526,7 @@ def _add(q, first, end, row, runs, kinds, spans, used):
 
 @njit(inline="always", error_model="numpy")
 def find_closed_columns(outline, points, row, columns):
-    """First and end column of a row that lie on a closed point, segment or triangle."""
+    """Return first and end column of a row that lie on a closed point, segment or triangle."""
     left = np.inf
     right = -np.inf
     for k in range(points):

@@ -32,6 +32,7 @@ class PerPixel(Slicer):
     """Locates every pixel by brute force."""
 
     def cut_image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
+        """Cut the image, trilinear in float64."""
         inside, index = self._voxels(nodes, plane)
         lower = np.minimum(index.astype(np.int64), np.maximum(np.array(self._volume.shape) - 2, 0))
         upper = np.minimum(lower + 1, np.array(self._volume.shape) - 1)
@@ -46,6 +47,7 @@ class PerPixel(Slicer):
         return image
 
     def cut_labels(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
+        """Cut the label image from the rest place of each pixel."""
         labels = get_label_voxels(self._volume)[0].reshape(self._volume.shape)
         inside, index = self._voxels(nodes, plane)
         image = np.zeros(inside.shape, dtype=np.uint8)
@@ -53,6 +55,7 @@ class PerPixel(Slicer):
         return image
 
     def compute_rest_coordinates(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.float64]:
+        """Compute the rest place of each pixel's tissue by its barycentric coordinates."""
         moved = require_finite_nodes(nodes, len(self._mesh.nodes))
         covered, *_ = self._place(self._mesh.nodes, plane)
         rest, *_ = self._place(moved, plane)
@@ -63,6 +66,7 @@ class PerPixel(Slicer):
         return rest
 
     def locate_pixels(self, nodes: ArrayLike, plane: SlicePlane) -> LocatedPixels:
+        """Find the first tetrahedron that holds each pixel."""
         moved = require_finite_nodes(nodes, len(self._mesh.nodes))
         covered, *_ = self._place(self._mesh.nodes, plane)
         rest, kept, elements = self._place(moved, plane)
@@ -81,7 +85,7 @@ class PerPixel(Slicer):
     def _voxels(
         self, nodes: ArrayLike, plane: SlicePlane
     ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """(rows, columns) which pixels lie in the volume, and the voxel indices (P, 3) of those.
+        """Return which pixels (rows, columns) lie in the volume, and their voxel indices (P, 3).
 
         The outer half voxel takes the index of the outermost centre.
         """
@@ -93,7 +97,7 @@ class PerPixel(Slicer):
     def _place(
         self, nodes: NDArray[np.float64], plane: SlicePlane
     ) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.int32]]:
-        """Rest place of each pixel, (rows, columns, 3) m, NaN outside the mesh.
+        """Return the rest place of each pixel, (rows, columns, 3) m, NaN outside the mesh.
 
         Also the tetrahedra (E,) on the image, and which of them each pixel is in (rows, columns),
         -1 outside all.
@@ -116,7 +120,7 @@ class PerPixel(Slicer):
 
 
 def _boxes(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(M, 2) least and greatest column and row of each tetrahedron's cut; inf, -inf without one.
+    """Return (M, 2) least and greatest column and row of each cut; inf, -inf without one.
 
     Args:
         corners: (M, 4, 3) column, row and height above the plane.
@@ -136,9 +140,9 @@ def _boxes(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[n
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _locate(corners, places, first, last, rest, elements, first_row, end_row):
-    """Rest positions of the pixels of some rows; a pixel in several tetrahedra takes the first.
+    """Fill rest positions of the pixels of some rows; of several tetrahedra the first holds.
 
-    Args:
+    Shapes and units:
         corners: (E, 4, 3) column, row and height of the tetrahedra's nodes.
         places: (E, 4, 3) m, the nodes at rest. first, last: (E, 2) columns and rows.
         rest: (rows, columns, 3) m, NaN, filled here where a tetrahedron is.
@@ -169,7 +173,7 @@ def _locate(corners, places, first, last, rest, elements, first_row, end_row):
 
 @njit(inline="always", error_model="numpy")
 def _six_volumes(c):
-    """The triple product of the edges from the first of four corners (4, 3)."""
+    """Return the triple product of the edges from the first of four corners (4, 3)."""
     u = c[1, 0] - c[0, 0], c[1, 1] - c[0, 1], c[1, 2] - c[0, 2]
     v = c[2, 0] - c[0, 0], c[2, 1] - c[0, 1], c[2, 2] - c[0, 2]
     w = c[3, 0] - c[0, 0], c[3, 1] - c[0, 1], c[3, 2] - c[0, 2]

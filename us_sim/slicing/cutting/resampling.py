@@ -3,7 +3,8 @@
 >>> import numpy as np
 >>> from us_sim.slicing.cutting.resampling import LocatedPixels
 >>> shift = np.array([[[5.0, 1, 0], [5, 0, 0], [0, 0, 1]]])  # five voxels along the first two axes
->>> located = LocatedPixels(np.zeros((2, 3), np.int32), np.concatenate([shift, shift]), np.array([7]))
+>>> maps = np.concatenate([shift, shift])
+>>> located = LocatedPixels(np.zeros((2, 3), np.int32), maps, np.array([7]))
 >>> located.compute_rest_index()[1, 2]
 array([7., 5., 1.])
 """
@@ -40,6 +41,8 @@ def run_rows_in_parallel(
     """Do ``work(first_row, end_row)`` for all rows in parallel, one run of them a thread.
 
     Args:
+        threads: how many, the caller's own among them.
+        rows: how many.
         work: a kernel that does not hold the interpreter's lock.
         band: rows that stay together: every run starts at a multiple of it.
     """
@@ -70,7 +73,7 @@ class LocatedPixels(NamedTuple):
     tetrahedra: NDArray[np.intp]  # (E,) the mesh's own numbers of those that maps are of
 
     def compute_rest_index(self) -> NDArray[np.float64]:
-        """(rows, columns, 3) voxel indices of where each pixel's tissue lies at rest.
+        """Return (rows, columns, 3) voxel indices of where each pixel's tissue lies at rest.
 
         Outside the mesh that is the pixel itself; NaN where nothing is shown.
         """
@@ -82,7 +85,7 @@ class LocatedPixels(NamedTuple):
         return np.asarray(index)
 
     def take_every(self, steps: tuple[int, int]) -> LocatedPixels:
-        """Every so many-th row and column of the elements, with the same maps."""
+        """Return every n-th row and column of the elements (n by ``steps``), with the same maps."""
         elements = np.ascontiguousarray(self.elements[:: steps[0], :: steps[1]])
         return LocatedPixels(elements, self.maps, self.tetrahedra)
 
@@ -90,11 +93,12 @@ class LocatedPixels(NamedTuple):
 def evaluate_affine(
     maps: NDArray[np.float64], elements: NDArray[np.int32], *, threads: int = 1
 ) -> NDArray[np.float32]:
-    """Values (rows, columns, K) of functions affine in (column, row) in each tetrahedron.
+    """Evaluate functions (rows, columns, K) that are affine in (column, row) in each tetrahedron.
 
     Args:
         maps: (E, K, 3) coefficients of (1, column, row).
-        elements: (rows, columns) as `Located.elements`.
+        elements: (rows, columns) as `LocatedPixels.elements`.
+        threads: how many work.
 
     Returns:
         NaN wherever no tetrahedron is.
@@ -109,7 +113,7 @@ def evaluate_affine(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _evaluate(maps, elements, first_row, end_row, values):
-    """Fills rows of ``values`` (rows, columns, K) a run of pixels of one tetrahedron at a time."""
+    """Fill rows of ``values`` (rows, columns, K) a run of pixels of one tetrahedron at a time."""
     columns = elements.shape[1]
     for row in range(first_row, end_row):
         line = elements[row]
@@ -132,7 +136,7 @@ def _evaluate(maps, elements, first_row, end_row, values):
 
 
 def sample_plane(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDArray[np.uint8]:
-    """The image (rows, columns) on a plane through the volume as it is, without tissue.
+    """Sample the image (rows, columns) on a plane through the volume as it is, without tissue.
 
     Values are those of `span_sampling`, and do not depend on the number of threads.
 
@@ -158,7 +162,7 @@ def sample_plane(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDAr
 
 
 def sample_labels(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDArray[np.uint8]:
-    """The label image (rows, columns) on a plane through the volume as it is.
+    """Sample the label image (rows, columns) on a plane through the volume as it is.
 
     Raises:
         VolumeError: the volume has no labels.
@@ -178,7 +182,7 @@ def sample_labels(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDA
 
 
 def make_full_runs(plane: SlicePlane) -> NDArray[np.int32]:
-    """(rows, 2, 2) as `SlicePlane.spans`, for an image that fills its grid."""
+    """Make (rows, 2, 2) spans, as `SlicePlane.spans`, of an image that fills its grid."""
     runs = np.zeros((plane.rows, 2, 2), dtype=np.int32)
     runs[:, 0, 1] = plane.columns
     runs.flags.writeable = False  # as a plane's own are, or numba would compile the kernels twice
@@ -186,7 +190,7 @@ def make_full_runs(plane: SlicePlane) -> NDArray[np.int32]:
 
 
 def compute_pixel_to_index(volume: Volume, plane: SlicePlane) -> NDArray[np.float64]:
-    """(3, 3) map from (1, column, row) to voxel indices, for a plane through the rigid volume."""
+    """Compute the (3, 3) map from (1, column, row) to voxel indices, on a plane in the volume."""
     to_index = volume.patient_to_index
     steps = np.column_stack([plane.origin, plane.column_step, plane.row_step])
     steps = to_index[:3, :3] @ steps
@@ -195,7 +199,7 @@ def compute_pixel_to_index(volume: Volume, plane: SlicePlane) -> NDArray[np.floa
 
 
 def flatten_voxels(array: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """A volume's voxels as the kernels take them: flat and read-only, and their shape (3,)."""
+    """Return voxels as the kernels take them, flat and read-only, and their shape (3,)."""
     # Read-only always, since numba would compile the kernels again for memory-mapped volumes.
     flat = np.asarray(array).reshape(-1)
     flat.flags.writeable = False
@@ -203,7 +207,7 @@ def flatten_voxels(array: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray
 
 
 def get_grey_voxels(volume: Volume) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """The grey values' voxels as `sample_spans` takes them.
+    """Return the grey values' voxels as `sample_spans` takes them, and their shape (3,).
 
     Raises:
         VolumeError: there are too many.
@@ -222,7 +226,7 @@ def get_grey_voxels(volume: Volume) -> tuple[NDArray[np.uint8], NDArray[np.int64
 
 
 def get_label_voxels(volume: Volume) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """The labels' voxels as the kernels take them.
+    """Return the labels' voxels as the kernels take them, and their shape (3,).
 
     Raises:
         VolumeError: the volume has no labels.
@@ -234,9 +238,9 @@ def get_label_voxels(volume: Volume) -> tuple[NDArray[np.uint8], NDArray[np.int6
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def sample_nearest(voxels, shape, maps, elements, first_row, last_row, image):
-    """Labels of the nearest voxels in rows ``first_row`` to ``last_row - 1`` of an image.
+    """Fill rows ``first_row`` to ``last_row - 1`` of an image with the nearest voxels' labels.
 
-    Args:
+    Shapes and units:
         voxels: (I*J*K,) uint8, shape: (3,) its sides.
         maps: (E, 3, 3) from (1, column, row) to voxel indices.
         elements: (rows, columns) int32, which map holds at a pixel; negative for none (0).
@@ -261,5 +265,5 @@ def sample_nearest(voxels, shape, maps, elements, first_row, last_row, image):
 
 @njit(inline="always", error_model="numpy")
 def _is_within(index, count):
-    """Whether an index lies between the outer faces of the outermost voxels."""
+    """Return True if an index lies between the outer faces of the outermost voxels."""
     return index >= -0.5 - SLACK and index <= count - 0.5 + SLACK

@@ -1,9 +1,9 @@
 """Exact images of deformed tissue: every tetrahedron that an image cuts is scan-converted.
 
-`section.TetrahedronClusters` finds the tetrahedra that the image may meet; `cut_polygons` gives each its
-polygon, the affine map from pixels to rest, and the spans of pixels in it; `span_sampling` looks
-these up in the volume. The outline of the mesh at rest tells tissue that was pushed away from what
-lies beside it.
+`section.TetrahedronClusters` finds the tetrahedra that the image may meet; `cut_polygons` gives
+each its polygon, the affine map from pixels to rest, and the spans of pixels in it; `span_sampling`
+looks these up in the volume. The outline of the mesh at rest tells tissue that was pushed away from
+what lies beside it.
 
 >>> import numpy as np
 >>> from us_sim.geometry.pose import Pose
@@ -16,7 +16,7 @@ lies beside it.
 >>> to_patient[:2, 3] = -0.02
 >>> mesh = box_mesh([-0.02, 0.02], [-0.02, 0.02], [0.0, 0.02, 0.04])
 >>> slicer = ScanConversion(Volume(ramp, to_patient, None, {}), mesh.nodes, mesh.tetrahedra)
->>> plane = LinearProbe(aperture=0.02, depth=0.02, columns=8, rows=5).plane(Pose())
+>>> plane = LinearProbe(aperture=0.02, depth=0.02, columns=8, rows=5).make_plane(Pose())
 >>> slicer.cut_image(mesh.nodes * [1, 1, 0.5], plane)[:, 0]
 array([ 4, 12, 20, 28, 36], dtype=uint8)
 """
@@ -77,6 +77,7 @@ class ScanConversion(Slicer):
         self._drawn: tuple[ArrayLike, SlicePlane, int, Outline] | None = None
 
     def cut_image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
+        """Cut the image, by spans of pixels."""
         count, pieces, outline, is_covered = self._cut(nodes, plane)
         runs = self._shown(plane)
         image = np.empty((plane.rows, plane.columns), dtype=np.uint8)
@@ -95,6 +96,7 @@ class ScanConversion(Slicer):
         return image
 
     def locate_pixels(self, nodes: ArrayLike, plane: SlicePlane) -> LocatedPixels:
+        """Find the tetrahedron and the rest place of each pixel, by spans of pixels."""
         count, outline, runs, spans = self._spans_of(nodes, plane)
         elements = np.empty((plane.rows, plane.columns), dtype=np.int32)
         fill_elements(spans, self._used, runs, count, BLACK, *outline, elements)
@@ -103,6 +105,7 @@ class ScanConversion(Slicer):
     def locate_pixel_subset(
         self, nodes: ArrayLike, plane: SlicePlane, steps: tuple[int, int]
     ) -> LocatedPixels:
+        """Locate every n-th row and column from 0 on, without the pixels in between."""
         count, outline, runs, spans = self._spans_of(nodes, plane)
         shape = -(-plane.rows // steps[0]), -(-plane.columns // steps[1])
         elements = np.empty(shape, dtype=np.int32)
@@ -126,7 +129,7 @@ class ScanConversion(Slicer):
         return count, outline, runs, self._convert(count, pieces, runs, 0, plane.rows)
 
     def _cut(self, nodes: ArrayLike, plane: SlicePlane) -> tuple[int, int, Outline, bool]:
-        """Fills the cuts, followed by the rigid map.
+        """Fill the cuts, followed by the rigid map.
 
         Returns:
             how many there are, and how many outlines; the mesh at rest; and whether the cuts are
@@ -147,7 +150,7 @@ class ScanConversion(Slicer):
         return count, pieces, outline, is_covered
 
     def _as_kernels_take(self, nodes: ArrayLike) -> NDArray[np.float64]:
-        """Nodes (N, 3) m, contiguous float64, without a copy where they are so."""
+        """Return nodes (N, 3) m as contiguous float64, without a copy where they are so."""
         array = np.asarray(nodes)
         if array.shape != self._moved.shape:
             require_finite_nodes(array, len(self._moved))
@@ -157,7 +160,7 @@ class ScanConversion(Slicer):
         return self._moved
 
     def _shown(self, plane: SlicePlane) -> NDArray[np.int32]:
-        """(rows, 2, 2) the runs of columns that an image shows, once there is room for its spans.
+        """Return (rows, 2, 2) the runs of columns that an image shows; make room for its spans.
 
         A row has no more spans than pixels, unless deformed tissue overlaps itself.
         """
@@ -187,7 +190,7 @@ class ScanConversion(Slicer):
 def _among_centres(
     rest_index: NDArray[np.float64], tetrahedra: NDArray[np.int32], shape: tuple[int, int, int]
 ) -> NDArray[np.bool_]:
-    """(M,) which tetrahedra lie well among the centres of the volume's voxels."""
+    """Return (M,) True for tetrahedra that lie well among the centres of the volume's voxels."""
     last = np.array(shape) - 1 - INNER_MARGIN
     among = (rest_index >= INNER_MARGIN) & (rest_index <= last)
     return np.asarray(among[tetrahedra].all(axis=(1, 2)))
@@ -196,7 +199,7 @@ def _among_centres(
 def _neighbours(
     tetrahedra: NDArray[np.int32], determinants: NDArray[np.float64]
 ) -> NDArray[np.int32]:
-    """(M, 4) the tetrahedron beyond the face opposite to each corner, -1 where there is none.
+    """Return (M, 4) the tetrahedron beyond the face opposite to each corner, -1 without one.
 
     A tetrahedron that is flat at rest is nobody's neighbour.
     """

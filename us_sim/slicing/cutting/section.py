@@ -19,11 +19,11 @@ FLAT = 1e-6
 
 @njit(inline="always", error_model="numpy")
 def compute_adjugate(place, n0, n1, n2, n3):
-    """A tetrahedron's determinant, and the barycentric coordinates of its last three corners.
+    """Compute a tetrahedron's determinant, and barycentric coordinates of its last three corners.
 
     Each is three coefficients, of 1, column and row, times the determinant.
 
-    Args:
+    Shapes and units:
         place: (N, 3) column, row and height above the plane. n0 … n3: which four are the corners.
     """
     x0, y0, z0 = place[n0, 0], place[n0, 1], place[n0, 2]
@@ -56,7 +56,7 @@ def compute_adjugate(place, n0, n1, n2, n3):
 
 @njit(inline="always", error_model="numpy")
 def is_solid(determinant, pixel_volume, rest_determinant):
-    """Whether a tetrahedron is neither inverted nor flat.
+    """Return True if a tetrahedron is neither inverted nor flat.
 
     ``pixel_volume`` is m³ per unit of the determinant, ``rest_determinant`` is m³.
     """
@@ -104,7 +104,7 @@ class RestMesh:
 
 
 def require_finite_nodes(nodes: ArrayLike, count: int | None) -> NDArray[np.float64]:
-    """Node positions as the kernels take them: (N, 3) float64, contiguous and finite.
+    """Return node positions as the kernels take them: (N, 3) float64, contiguous and finite.
 
     Raises:
         MeshError: they are not (count, 3), or not finite.
@@ -158,7 +158,7 @@ class TetrahedronClusters:
         self._near = np.empty(len(tetrahedra), dtype=np.int32)
 
     def find_near_plane(self, nodes: NDArray[np.float64], plane: SlicePlane) -> NDArray[np.int32]:
-        """(K,) tetrahedra that are not wholly beyond one side of the image, ascending.
+        """Return (K,) tetrahedra that are not wholly beyond one side of the image, ascending.
 
         The array is overwritten by the next call.
 
@@ -183,7 +183,7 @@ class TetrahedronClusters:
 
 
 def _along_a_z_curve(nodes: NDArray[np.float64], tetrahedra: NDArray[np.int32]) -> NDArray[np.intp]:
-    """(M,) the order of tetrahedra along a Z-order (Morton) curve through their centres."""
+    """Return (M,) the order of tetrahedra along a Z-order (Morton) curve through their centres."""
     if not len(tetrahedra):
         return np.empty(0, dtype=np.intp)
     centres = nodes[tetrahedra].mean(axis=1)
@@ -198,10 +198,10 @@ def _along_a_z_curve(nodes: NDArray[np.float64], tetrahedra: NDArray[np.int32]) 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _near(nodes, to_pixel, columns, rows, tetrahedra, starts, members, sides, near):
-    """Fills ``near`` and returns how many there are, or -1 when a node is not finite.
+def _near(nodes, to_pixel, columns, rows, tetrahedra, starts, members, sides, near):  # noqa: PLR0913
+    """Fill ``near`` and return how many there are, or -1 when a node is not finite.
 
-    Args:
+    Shapes and units:
         nodes: (N, 3) m. to_pixel: (3, 4) from m to column, row and height above the plane.
         starts (clusters + 1,), members (…, 4): the nodes of each cluster.
         sides: (N,) uint8 to work in: a bit for each side of the image that a node is beyond.
@@ -230,7 +230,7 @@ def _near(nodes, to_pixel, columns, rows, tetrahedra, starts, members, sides, ne
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _find_sides(nodes, to_pixel, right, bottom, sides):
-    """Fill the sides of the image that each node is beyond; returns whether all are finite."""
+    """Fill the sides of the image that each node is beyond; return True if all are finite."""
     cx, cy, cz, c0 = to_pixel[0, 0], to_pixel[0, 1], to_pixel[0, 2], to_pixel[0, 3]
     rx, ry, rz, r0 = to_pixel[1, 0], to_pixel[1, 1], to_pixel[1, 2], to_pixel[1, 3]
     hx, hy, hz, h0 = to_pixel[2, 0], to_pixel[2, 1], to_pixel[2, 2], to_pixel[2, 3]

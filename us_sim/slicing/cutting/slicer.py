@@ -47,7 +47,7 @@ class Slicer(ABC):
         *,
         threads: int = 1,
     ) -> None:
-        """``rest_nodes`` (N, 3) m lie in the undeformed volume; ``tetrahedra`` (M, 4) index them.
+        """Take ``rest_nodes`` (N, 3) m in the undeformed volume; ``tetrahedra`` (M, 4) index them.
 
         The image does not depend on the number of threads.
         """
@@ -60,7 +60,7 @@ class Slicer(ABC):
 
     @abstractmethod
     def cut_image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
-        """The B-mode image (rows, columns) with the mesh at ``nodes`` (N, 3) m.
+        """Cut the B-mode image (rows, columns) with the mesh at ``nodes`` (N, 3) m.
 
         Grey values are trilinear in the undeformed volume.
 
@@ -70,7 +70,7 @@ class Slicer(ABC):
 
     @abstractmethod
     def locate_pixels(self, nodes: ArrayLike, plane: SlicePlane) -> LocatedPixels:
-        """Where each pixel lies in the mesh.
+        """Find the tetrahedron and the rest place of each pixel.
 
         Right after an image of these same two objects the mesh is not cut again, so nodes must not
         be written to in between.
@@ -82,11 +82,11 @@ class Slicer(ABC):
     def locate_pixel_subset(
         self, nodes: ArrayLike, plane: SlicePlane, steps: tuple[int, int]
     ) -> LocatedPixels:
-        """As `locate_pixels`, of every so many-th row and column from 0 on."""
+        """Locate every n-th row and column from 0 on, n by ``steps``."""
         return self.locate_pixels(nodes, plane).take_every(steps)
 
     def cut_labels(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
-        """The label image (rows, columns): the nearest voxel's label, 0 where there is nothing.
+        """Cut the label image (rows, columns): the nearest voxel's label, 0 where there is nothing.
 
         Raises:
             VolumeError: the volume has no labels.
@@ -96,11 +96,11 @@ class Slicer(ABC):
         return self.sample_located_labels(self._locate_anew(nodes, plane))
 
     def _locate_anew(self, nodes: ArrayLike, plane: SlicePlane) -> LocatedPixels:
-        """As `locate_pixels`, though nodes may have been written to since an image of them."""
+        """Locate the pixels, though nodes may have been written to since an image of them."""
         return self.locate_pixels(np.asarray(nodes).view(), plane)
 
     def sample_located_labels(self, located: LocatedPixels) -> NDArray[np.uint8]:
-        """The label image (rows, columns) of pixels that `locate_pixels` has found.
+        """Sample the label image (rows, columns) of pixels that `locate_pixels` has found.
 
         Raises:
             VolumeError: the volume has no labels.
@@ -116,7 +116,7 @@ class Slicer(ABC):
         return image
 
     def compute_rest_coordinates(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.float64]:
-        """Where each pixel's tissue lies at rest: (rows, columns, 3) m, frame ``patient``.
+        """Compute the rest place of each pixel's tissue: (rows, columns, 3) m, frame ``patient``.
 
         Outside the mesh that is the pixel itself; NaN where tissue moved away, and outside spans.
 
@@ -136,7 +136,7 @@ def create_slicer(
     *,
     threads: int = 1,
 ) -> Slicer:
-    """The slicer of that name among `SLICERS`; further arguments as for `Slicer`.
+    """Create the slicer of that name among `SLICERS`; further arguments as for `Slicer`.
 
     Raises:
         SettingsError: there is no method of that name; the sentence says which there are.

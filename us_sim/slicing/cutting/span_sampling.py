@@ -41,13 +41,13 @@ _COLUMN = (1 << END_SHIFT) - 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sample_spans(
+def sample_spans(  # noqa: PLR0913
     voxels, shape, maps, inside, rigid, spans, used, runs,
     is_covered, outlines, points, turns, outline_number, first_row, end_row, image,
 ):  # fmt: skip
-    """Trilinear grey values of rows ``first_row`` to ``end_row - 1`` of an image.
+    """Fill rows ``first_row`` to ``end_row - 1`` of an image with trilinear grey values.
 
-    Args:
+    Shapes and units:
         voxels: (I*J*K,) uint8, shape: (3,) its sides; where K is 1 each voxel is there twice.
         maps, inside: as `cut_polygons.Cuts`; the map with the number ``rigid`` is that of pixels
             outside the mesh.
@@ -95,18 +95,24 @@ def sample_spans(
                 _write_rigid(maps[rigid], shape, row, first, end, covered, x, y, z)
             _sample(voxels, shape, x[first:end], y[first:end], z[first:end], room, line[first:end])
             if negative:
-                for i in range(first, end):
-                    if x[i] < 0:
-                        line[i] = 0
+                _blacken_nowhere(x[first:end], line[first:end])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_elements(
+def _blacken_nowhere(x, line):
+    """Set the pixels without a place at rest to 0."""
+    for i in range(len(x)):
+        if x[i] < 0:
+            line[i] = 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_elements(  # noqa: PLR0913
     spans, used, runs, rigid, black, outlines, points, turns, outline_number, elements
 ):
     """Fill ``elements`` (rows, columns) int32 with the number of each pixel's map.
 
-    Args:
+    Shapes and units:
         rigid: the number of the map outside the mesh. black: the number for no map.
         spans … outline_number: as for `sample_spans`.
     """
@@ -128,13 +134,13 @@ def fill_elements(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_element_subset(
+def fill_element_subset(  # noqa: PLR0913
     spans, used, runs, rigid, black, outlines, points, turns, outline_number, steps, columns,
     elements,
 ):  # fmt: skip
-    """As `fill_elements`, of every so many-th row and column of an image.
+    """Fill elements as `fill_elements` does, of every n-th row and column of an image.
 
-    Args:
+    Shapes and units:
         steps: (2,) rows and columns of the image from one element to the next.
     """
     rows, places = elements.shape
@@ -171,7 +177,7 @@ def fill_element_subset(
 
 @njit(inline="always", error_model="numpy")
 def _write_span(m, row, first, end, x, y, z):
-    """Rest coordinates of the pixels of a span, which lie well among the voxels' centres."""
+    """Write rest coordinates of the pixels of a span that lies well among the voxels' centres."""
     gx = m[0, 1] * _ONE
     gy = m[1, 1] * _ONE
     gz = m[2, 1] * _ONE
@@ -190,7 +196,7 @@ def _write_span(m, row, first, end, x, y, z):
 
 @njit(inline="always", error_model="numpy")
 def _is_inner(m, shape, row, first, end):
-    """Whether both ends of a span lie well among the voxels' centres, and so all of it."""
+    """Return True if both ends of a span, and so all of it, lie well among the voxels' centres."""
     inner = True
     for a in range(3):
         start = m[a, 0] + m[a, 2] * row
@@ -203,7 +209,7 @@ def _is_inner(m, shape, row, first, end):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _write_clipped(m, shape, row, first, end, x, y, z):
-    """Rest coordinates of the pixels of a span, held at the volume's borders."""
+    """Write rest coordinates of the pixels of a span, held at the volume's borders."""
     low = first
     high = end
     for a in range(3):
@@ -239,8 +245,8 @@ def _clamp_index(index, count):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _write_rigid(m, shape, row, first, end, covered, x, y, z):
-    """Places the pixels that are still open by the rigid map, or nowhere if covered at rest."""
+def _write_rigid(m, shape, row, first, end, covered, x, y, z):  # noqa: PLR0913
+    """Place the pixels that are still open by the rigid map, or nowhere if covered at rest."""
     i = first
     while i < end:
         start = i
@@ -258,7 +264,7 @@ def _write_rigid(m, shape, row, first, end, covered, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _between(least, most, start, slope, first, end):
-    """First and end column of a span where an index lies from ``least`` to ``most``."""
+    """Return first and end column of a span where an index lies from ``least`` to ``most``."""
     if first >= end:
         return first, first
     at_first = start + slope * first
@@ -295,7 +301,7 @@ def _least(x):
 
 @njit(inline="always", error_model="numpy")
 def _sample(voxels, shape, x, y, z, room, line):
-    """Trilinear values of the pixels of a row; any value for those that lie nowhere.
+    """Fill a row with trilinear values; pixels that lie nowhere get any value.
 
     ``room``: (11, …) int32, of which the last eight lines are used.
     """
@@ -333,7 +339,7 @@ def _sample(voxels, shape, x, y, z, room, line):
 
 @njit(inline="always", error_model="numpy")
 def _blend_pair(pair, weight):
-    """The blend of a pair of grey values, in 64ths; ``weight`` is the second's, in 32768ths."""
+    """Blend a pair of grey values, in 64ths; ``weight`` is the second's, in 32768ths."""
     low = np.int16(pair & np.uint16(255))
     to_high = np.int16(np.int16(pair >> np.uint16(8)) - low)
     step = np.int16((np.int32(np.int16(to_high << np.int16(7))) * np.int32(weight)) >> np.int32(16))
@@ -342,7 +348,7 @@ def _blend_pair(pair, weight):
 
 @njit(inline="always", error_model="numpy")
 def _blend(low, high, weight):
-    """The linear blend of two values, all in 64ths; ``weight`` is the second's, in 32768ths."""
+    """Blend two values, all in 64ths; ``weight`` is the second's, in 32768ths."""
     to_high = np.int16(np.int16(high - low) << np.int16(1))
     return np.int16(low + np.int16((np.int32(to_high) * np.int32(weight)) >> np.int32(16)))
 
@@ -376,7 +382,7 @@ def _write_ramp(_: Any, array: Any, index: Any, start: Any, step: Any, count: An
     return types.void(array, index, *numbers), generate
 
 
-def _load_pairs(
+def _load_pairs(  # noqa: PLR0913
     _: Any, voxels: Any, near: Any, first: Any, to_y: Any, to_x: Any, p00: Any, p01: Any,
     p10: Any, p11: Any,
 ) -> Any:  # fmt: skip

@@ -5,7 +5,8 @@
 >>> from us_sim.slicing.probe.probe import LinearProbe
 >>> probe = LinearProbe(aperture=0.04, depth=0.05, columns=400, rows=500)
 >>> annotation = Annotation(probe, {5: ("vein", (0.25, 0.4, 0.85))})
->>> annotation.draw_annotated(np.zeros((500, 400), np.uint8), badge=Badge("LOST", (230, 40, 40))).shape
+>>> badge = Badge("LOST", (230, 40, 40))
+>>> annotation.draw_annotated(np.zeros((500, 400), np.uint8), badge=badge).shape
 (500, 400, 3)
 """
 
@@ -88,16 +89,17 @@ class Annotation:
         lines: Sequence[NDArray[np.floating]] = (),
         refine: Refine | None = None,
     ) -> NDArray[np.uint8]:
-        """A new (rows, columns, 3) picture of red, green and blue.
+        """Draw a new (rows, columns, 3) picture of red, green and blue.
 
         Args:
             pixels: (rows, columns) grey.
             labels: (rows, columns), where outlines are wanted.
+            badge: where the image is not live.
             overlay: colours over the grey, below all else, and their bar.
             lines: (N, 2) column and row, such as a gate's.
             refine: of the labels' outlines, as for `label_outlines`.
 
-        All as in an image that is not flipped.
+        All are as in an image that is not flipped.
         """
         if self.is_flipped:
             pixels = np.ascontiguousarray(pixels[:, ::-1])
@@ -178,7 +180,7 @@ class Annotation:
         )
 
     def _place(self, label: TextPatch, column: int, row: int) -> None:
-        """Draw that label with every picture, if it lies inside and on no other."""
+        """Have every picture show a label, if that lies inside and on no other."""
         box = _box(label, column, row)
         if _lies_in(box, self._picture) and not _is_taken(box, self._occupied):
             self._labels.append((label, column, row))
@@ -191,7 +193,7 @@ class Annotation:
         drawn: list[Box],
         refine: Refine | None,
     ) -> None:
-        """Thin outlines of the structures, and the name of each once, at its longest outline."""
+        """Draw thin outlines of the structures, and each name once, at its longest outline."""
         named: list[tuple[TextPatch, Box]] = []
         for number, (name, colour) in self._structures.items():
             smoothing = self._text / 2.5
@@ -218,7 +220,7 @@ class Annotation:
                 taken.append(box)
 
     def _beside(self, label: TextPatch, outline: Box) -> list[Box]:
-        """Boxes for a name: above the outline, below, right, left, and in its middle."""
+        """Return boxes for a name: above the outline, below, right, left, and in its middle."""
         left, top, right, bottom = outline
         column = max(0, min((left + right - label.width) // 2, self._columns - label.width))
         row = max(0, min((top + bottom - label.height) // 2, self._rows - label.height))
@@ -233,7 +235,7 @@ class Annotation:
         return [box for box in boxes if _lies_in(box, self._picture)]
 
     def _mark(self, picture: NDArray[np.uint8], badge: Badge) -> None:
-        """A frame around the picture and the badge's text at its top."""
+        """Draw a frame around the picture and the badge's text at its top."""
         width = self._frame
         for height in range(2 * self._text, 5, -1):
             label = render_text(badge.text, height, badge.colour)
@@ -253,7 +255,7 @@ def _bright(colour: tuple[float, float, float]) -> Colour:
 
 
 def _steps(spacing: float, count: int, pixels: float) -> tuple[float, float]:
-    """Distances (m) of labels, at least that many pixels apart, and of ticks.
+    """Return the distances (m) of labels, at least so many pixels apart, and of ticks.
 
     Labels are 5, 10, 20, 50, … mm apart, in a very small image 1, 2, 5, … mm.
     """

@@ -32,10 +32,11 @@ def trace_label_outlines(
     smoothing: float = 1.0,
     refine: Refine | None = None,
 ) -> list[NDArray[np.float64]]:
-    """Closed outlines of the areas and holes of one label, the longest first.
+    """Trace closed outlines of the areas and holes of one label, the longest first.
 
     Args:
         labels: (rows, columns).
+        label: whose outlines are wanted.
         smoothing: pixels, about the length of the steps between pixels that are smoothed away.
         refine: moves points of a label's outline to where it runs between voxels.
 
@@ -58,7 +59,7 @@ def trace_label_outlines(
 
 
 def _smooth(chain: NDArray[Any], smoothing: float) -> NDArray[np.float64]:
-    """A chain of neighbouring pixels on the inside (P, 2), smoothed and moved half a pixel out.
+    """Smooth a chain of pixels (P, 2) on the inside, and move it half a pixel out.
 
     A Gaussian in the outline's Fourier series, applied as g (2 - g) so that circles hardly shrink.
     """
@@ -92,20 +93,20 @@ _found: WeakKeyDictionary[Volume, dict[int, _Share]] = WeakKeyDictionary()
 
 
 def snap_to_border(frame: Frame, label: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Move points (P, 2), column and row, that are near a label's border onto it.
+    """Move points (P, 2), column and row, near a label's border onto it.
 
     Points at the image's sides, and where there is no tissue, stay.
     """
     share = _share_of(frame.volume, label)
     elements, maps, _ = frame.placed
     moved = np.array(points, dtype=np.float64)
-    _settle(elements, maps, share.field, share.start, share.level, moved)
+    _move_to_level(elements, maps, share.field, share.start, share.level, moved)
     return moved
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _settle(elements, maps, field, start, level, points):
-    """Newton's method along the slope of ``field`` (i, j, k), for each of ``points`` (P, 2)."""
+def _move_to_level(elements, maps, field, start, level, points):
+    """Move points (P, 2) along the slope of ``field`` (i, j, k) to its level: Newton's method."""
     rows, columns = elements.shape
     index = np.empty(3)
     part = np.empty(3)
@@ -124,24 +125,7 @@ def _settle(elements, maps, field, start, level, points):
                 inside = min(max(index[axis], 0.0), field.shape[axis] - 1.001)
                 cell[axis] = np.int64(inside)
                 part[axis] = inside - cell[axis]
-            value = -level
-            across = down = 0.0
-            for corner in range(8):
-                weight = 1.0
-                for axis in range(3):
-                    weight *= part[axis] if corner >> axis & 1 else 1.0 - part[axis]
-                i = cell[0] + (corner & 1)
-                j = cell[1] + (corner >> 1 & 1)
-                k = cell[2] + (corner >> 2 & 1)
-                share = field[i, j, k]
-                value += weight * share
-                for axis in range(3):
-                    slope = 1.0 if corner >> axis & 1 else -1.0
-                    for other in range(3):
-                        if other != axis:
-                            slope *= part[other] if corner >> other & 1 else 1.0 - part[other]
-                    across += slope * share * m[axis, 1]
-                    down += slope * share * m[axis, 2]
+            value, across, down = _interpolate_field(field, cell, part, m, -level)
             steepness = np.sqrt(across * across + down * down)
             if steepness < _FLAT:
                 break
@@ -150,6 +134,29 @@ def _settle(elements, maps, field, start, level, points):
             y += length * down
         points[p, 0] = x
         points[p, 1] = y
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _interpolate_field(field, cell, part, m, value):
+    """Add the field at a place in a cell to ``value``; return its slopes along the image, too."""
+    across = down = 0.0
+    for corner in range(8):
+        weight = 1.0
+        for axis in range(3):
+            weight *= part[axis] if corner >> axis & 1 else 1.0 - part[axis]
+        i = cell[0] + (corner & 1)
+        j = cell[1] + (corner >> 1 & 1)
+        k = cell[2] + (corner >> 2 & 1)
+        share = field[i, j, k]
+        value += weight * share
+        for axis in range(3):
+            slope = 1.0 if corner >> axis & 1 else -1.0
+            for other in range(3):
+                if other != axis:
+                    slope *= part[other] if corner >> other & 1 else 1.0 - part[other]
+            across += slope * share * m[axis, 1]
+            down += slope * share * m[axis, 2]
+    return value, across, down
 
 
 def _share_of(volume: Volume, label: int) -> _Share:

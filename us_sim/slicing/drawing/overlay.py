@@ -35,16 +35,16 @@ class TextPatch:
 
     @property
     def height(self) -> int:
-        """px."""
+        """Height, px."""
         return self.opacity.shape[0]
 
     @property
     def width(self) -> int:
-        """px."""
+        """Width, px."""
         return self.opacity.shape[1]
 
     def draw_at(self, picture: NDArray[np.uint8], column: int, row: int) -> bool:
-        """Blend it into a (rows, columns, 3) picture with its upper left corner there.
+        """Blend the text into a (rows, columns, 3) picture with its upper left corner there.
 
         Returns:
             False where it would not be inside the picture; then nothing is drawn.
@@ -59,7 +59,7 @@ class TextPatch:
 
 @lru_cache(maxsize=64)
 def render_text(text: str, height: int, colour: Colour) -> TextPatch:
-    """``text`` with capital letters about ``height`` px high."""
+    """Render ``text`` with capital letters about ``height`` px high."""
     letters = _letters(text, height)
     padded = np.pad(letters, _HALO)
     halo = cv2.GaussianBlur(cv2.dilate(padded, np.ones((3, 3), np.uint8)), (3, 3), 0.0)
@@ -81,7 +81,7 @@ def _letters(text: str, height: int) -> NDArray[np.float32]:
 
 @lru_cache(maxsize=64)
 def _scale(large: int) -> float:
-    """The scale at which capitals are that high; strokes add to it in some versions of OpenCV."""
+    """Return the font's scale for capitals ``large`` px high, with the strokes OpenCV may add."""
     first = large / _CAPITAL
     return first * large / _cropped("H", large, first).shape[0]
 
@@ -115,14 +115,14 @@ class ColourScale:
         return np.rint(np.stack(rows, axis=1)).astype(np.uint8)
 
     def find_levels(self, values: NDArray[np.floating]) -> NDArray[np.uint8]:
-        """The row of `table` for each value of an array of any shape; any for NaN."""
+        """Find the row of `table` for each value of an array of any shape; any for NaN."""
         scale = np.float32(255.0 / (self.high - self.low))
         levels = (np.asarray(values, dtype=np.float32) - np.float32(self.low)) * scale
         np.nan_to_num(levels, copy=False)
         return np.asarray(np.rint(np.clip(levels, 0.0, 255.0, out=levels), out=levels), np.uint8)
 
     def format_value(self, value: float) -> str:
-        """A value as it stands at the bar, without the unit."""
+        """Format a value as the bar shows it, without the unit."""
         return f"{self.factor * value:.3g}"
 
 
@@ -145,7 +145,7 @@ class Overlay:
     outline: NDArray[np.floating] | None = None
 
     def flip_horizontally(self) -> Overlay:
-        """The same with left and right exchanged."""
+        """Return the overlay with left and right exchanged."""
         outline = self.outline
         if outline is not None:
             outline = mirror_line(outline, self.values.shape[1])
@@ -161,7 +161,7 @@ class Overlay:
 
 
 def mirror_line(line: NDArray[np.floating], columns: int) -> NDArray[np.floating]:
-    """Column and row (N, 2) in an image of so many columns whose left and right are exchanged."""
+    """Mirror column and row (N, 2) in an image of so many columns."""
     return np.column_stack([columns - 1 - line[:, 0], line[:, 1]])
 
 
@@ -203,7 +203,7 @@ class ColourBar:
         self._corner = margin, top
 
     def draw(self, picture: NDArray[np.uint8]) -> None:
-        """Draw it over a (rows, columns, 3) picture."""
+        """Draw the bar over a (rows, columns, 3) picture."""
         column, row = self._corner
         height, width = self._colours.shape[:2]
         rows, columns = picture.shape[:2]

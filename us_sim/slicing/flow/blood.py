@@ -58,7 +58,7 @@ class Blood:
         self._mesh: Mesh | None = None
 
     def advance_to_frame(self, frame: Frame) -> Blood:
-        """The same, gone on to a frame, once for all that ask.
+        """Advance all vessels to a frame, once for all callers; return self.
 
         Raises:
             MeshError: the frame's mesh cannot carry anything.
@@ -75,14 +75,14 @@ class Blood:
         return self
 
     def compute_velocity(self, frame: Frame, window: PixelWindow) -> NDArray[np.float32]:
-        """m/s along the beams towards the probe, as ``window`` has places; NaN outside lumens."""
+        """Return m/s along beams towards the probe at the window's places; NaN outside lumens."""
         factors = [float(vessel.evaluate_pulse(frame.time)) for vessel in self.vessels]
         return self._compute_velocity(frame, window, factors)[0]
 
     def compute_mean_velocities(
         self, frame: Frame, window: PixelWindow
     ) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
-        """Likewise averaged over the pulse, and which vessel each place is in, -1 for none."""
+        """Return velocities averaged over the pulse, and the vessel of each place, -1 for none."""
         return self._compute_velocity(frame, window, [1.0] * len(self.vessels))
 
     def _compute_velocity(
@@ -105,13 +105,13 @@ class Blood:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _find_velocity(
+def _find_velocity(  # noqa: PLR0913
     elements, maps, pixel, columns, rows, beam_x, beam_z, corner, station, offset, axis, number,
     velocity, which,
 ):  # fmt: skip
-    """Writes velocity (P,) and which (P,) of places in a vessel's lumen.
+    """Write velocity (P,) and which (P,) of places in a vessel's lumen.
 
-    Args:
+    Shapes and units:
         elements: of all pixels. maps: (E, 3, 3) from (1, column, row) to voxel indices.
         pixel: (P,) number of the pixel at each place, -1 outside the image. columns, rows: (P,).
         beam_x, beam_z: (P,) the beams' directions. corner: (3,) voxels.
@@ -178,9 +178,12 @@ class FlowAbsence(Enum):
 def explain_absence(
     blood: Blood, frame: Frame, window: PixelWindow, lines: NDArray[np.integer], wall_filter: float
 ) -> FlowAbsence:
-    """Why flow cannot be seen at the places of a window.
+    """Explain why flow cannot be seen at the places of a window.
 
     Args:
+        blood: the vessels.
+        frame: the image.
+        window: where in it.
         lines: of the probe, as many as places in the window, whose echoes come from there.
         wall_filter: m/s.
     """

@@ -52,7 +52,7 @@ _FIRST, _SECOND = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def draw_uniform(seed, place):
-    """A number above 0, and at most 1, for two numbers of type uint64: the same in every run.
+    """Draw a number above 0, and at most 1, from two of type uint64: the same in every run.
 
     By the finaliser of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014).
     """
@@ -66,7 +66,7 @@ def draw_uniform(seed, place):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def draw_normal_pair(seed, place):
-    """Two independent normal numbers (G. E. P. Box, M. E. Muller, 1958)."""
+    """Draw two independent normal numbers (G. E. P. Box, M. E. Muller, 1958)."""
     size = np.sqrt(-2.0 * np.log(draw_uniform(seed, place)))
     angle = 2.0 * np.pi * draw_uniform(seed ^ _SECOND, place)
     return size * np.cos(angle), size * np.sin(angle)
@@ -128,11 +128,11 @@ class ColourDoppler:
         return convert_to_pixels(self._probe, fraction + self._lean(depth), depth)
 
     def compute_true_velocity(self, blood: Blood, frame: Frame) -> NDArray[np.float32]:
-        """m/s along the box's beams towards the probe, at all pixels; NaN outside lumens."""
+        """Return m/s along the box's beams towards the probe, at all pixels; NaN outside lumens."""
         return blood.compute_velocity(frame, self._whole)
 
     def estimate_velocity(self, blood: Blood, frame: Frame) -> NDArray[np.float32]:
-        """m/s towards the probe (rows, columns) as estimated; NaN where no colour is shown.
+        """Estimate m/s towards the probe (rows, columns); NaN where no colour is shown.
 
         Noise is a function of the frame's time and the place.
         """
@@ -169,7 +169,7 @@ class ColourDoppler:
     def explain_absence(
         self, blood: Blood, frame: Frame, shown: NDArray[np.float32]
     ) -> FlowAbsence:
-        """Why an estimate of this frame shows no colour; nothing where it does."""
+        """Explain why an estimate of this frame shows no colour; NOTHING where it does."""
         if np.count_nonzero(np.isfinite(shown)) > _COLOURED * self._within.sum():
             return FlowAbsence.NOTHING
         return explain_absence(blood, frame, self._window, self._lines, self.settings.wall_filter)
@@ -182,7 +182,7 @@ class ColourDoppler:
         )
 
     def _lean(self, depth: NDArray[np.float64] | NDArray[np.float32]) -> NDArray[np.float64]:
-        """Shift of a steered beam from its place at the box's middle depth, as a fraction."""
+        """Return the shift (fraction) of a steered beam from its place in the box's middle."""
         if not isinstance(self._probe, LinearProbe):
             return np.zeros_like(depth)
         slope = math.tan(self.settings.steering) / self._probe.aperture
@@ -191,7 +191,7 @@ class ColourDoppler:
     def _lines_of(
         self, fraction: NDArray[np.float32], depth: NDArray[np.float32]
     ) -> NDArray[np.intp]:
-        """The line at whose place on the face the steered beam of each pixel starts."""
+        """Return the line at whose place on the face the steered beam of each pixel starts."""
         probe = self._probe
         start = np.nan_to_num(fraction)
         if isinstance(probe, LinearProbe):
@@ -224,14 +224,14 @@ class ColourDoppler:
 
 @njit(inline="always", error_model="numpy")
 def _wall_filter_gain(v, nyquist, wall):
-    """The part of a velocity's power that the wall filter lets through, whose input is aliased."""
+    """Return the part of a velocity's power that the wall filter, after aliasing, lets through."""
     fast = (v - 2.0 * nyquist * np.round(v / (2.0 * nyquist))) ** 4
     return fast / (fast + wall**4) if fast > 0.0 else 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_phasors(velocity, nyquist, wall, turned):
-    """Fills turned (rows, columns, 2): real and imaginary part of a place's R, without noise."""
+    """Fill turned (rows, columns, 2): real and imaginary part of a place's R, without noise."""
     for row in range(velocity.shape[0]):
         for column in range(velocity.shape[1]):
             v = velocity[row, column]
@@ -245,7 +245,7 @@ def _fill_phasors(velocity, nyquist, wall, turned):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_noise(seed, noise):
-    """Fills noise (rows, columns, 2) with independent normal numbers of variance 1/2."""
+    """Fill noise (rows, columns, 2) with independent normal numbers of variance 1/2."""
     for row in range(noise.shape[0]):
         for column in range(noise.shape[1]):
             place = np.uint64(row) * np.uint64(65536) + np.uint64(column)
@@ -256,7 +256,7 @@ def _fill_noise(seed, noise):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_velocities(turned, noise, within, nyquist, least, broadening, receiver, shown):
-    """Fills shown (rows, columns) with velocities where R with its noise is large enough."""
+    """Fill shown (rows, columns) with velocities where R with its noise is large enough."""
     for row in range(within.shape[0]):
         for column in range(within.shape[1]):
             if not within[row, column]:
@@ -322,7 +322,7 @@ class Spectrum:
             self._picture, self._seen = before._picture, before._seen
 
     def draw_sweep(self, blood: Blood, frame: Frame) -> NDArray[np.uint8]:
-        """The picture (rows, columns, 3) up to the frame, with its scales.
+        """Draw the picture (rows, columns, 3) up to the frame, with its scales.
 
         Between two frames the tissue is taken to be as in the later one; the pulse is not.
         """
@@ -333,7 +333,7 @@ class Spectrum:
         return self._picture.draw_picture()
 
     def explain_absence(self, blood: Blood, frame: Frame) -> FlowAbsence:
-        """Why the picture up to this frame shows no blood; nothing where it does."""
+        """Explain why the picture up to this frame shows no blood; NOTHING where it does."""
         if 0.0 <= frame.time - self._seen < self.settings.sweep:
             return FlowAbsence.NOTHING
         lines = np.full(self._window.shape, self._line)
@@ -342,9 +342,9 @@ class Spectrum:
     def compute_columns(
         self, blood: Blood, frame: Frame, moments: NDArray[np.float64]
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Grey spectra (rows, K) at times (K,) s, the fastest towards the probe on top.
+        """Compute grey spectra (rows, K) at times (K,) s, the fastest towards the probe on top.
 
-        And (K,) whether blood is seen in them: brighter than black, and than the noise.
+        Return with them (K,) True where blood is seen: brighter than black, and than the noise.
         """
         settings = self.settings
         means, which = blood.compute_mean_velocities(frame, self._window)
@@ -369,7 +369,7 @@ def _gate_lines(
     settings: SpectrumSettings,
     probe: Probe,
 ) -> list[NDArray[np.float64]]:
-    """Lines (2, 2), column and row: the gate's ends, and the vessel's direction as it is set."""
+    """Return lines (2, 2), column and row: the gate's ends, and the vessel's direction as set."""
     turn = settings.angle_correction
     vessel = math.cos(turn) * along + math.sin(turn) * across
     drawn = []
@@ -385,9 +385,9 @@ def _gate_lines(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_spectra(velocities, nyquist, lowest, wall, heard, seeds, power, peak):
-    """Fills power (rows, K) and peak (K,), its most without noise; row 0 is ``lowest``.
+    """Fill power (rows, K) and peak (K,), its most without noise; row 0 is ``lowest``.
 
-    Args:
+    Shapes and units:
         velocities: (K, P), NaN outside blood.
         heard: power of blood's echoes that the probe hears. seeds: (K,) of the noise.
     """
@@ -425,10 +425,13 @@ _REACH = 8e-3  # m around the nearest place of a vessel, which may cross the ima
 def find_nearest_vessel(
     blood: Blood, frame: Frame, lateral: float, depth: float, steering: float = 0.0
 ) -> tuple[float, float] | None:
-    """The centre in the image of the lumen nearest to a place; None without any.
+    """Find the centre in the image of the lumen nearest to a place; None without any.
 
     Args:
-        lateral, depth: of the place, fraction of the face and m, as of `convert_to_pixels`.
+        blood: the vessels.
+        frame: the image.
+        lateral: of the place, fraction of the face as of `convert_to_pixels`.
+        depth: of the place, m.
         steering: rad, of beams that lead to places.
     """
     probe = frame.probe
@@ -456,7 +459,7 @@ def find_nearest_vessel(
 
 
 def warm_up() -> None:
-    """Use every kernel of this room once, on a tube of a few voxels."""
+    """Run every kernel of this room once, on a tube of a few voxels."""
     x, z = np.meshgrid(np.arange(9) - 4, np.arange(9) - 4, indexing="ij")
     tube = np.repeat((x**2 + z**2 < 10)[:, None], 40, axis=1).astype(np.uint8)
     volume = Volume(tube, np.diag([1e-3, 1e-3, 1e-3, 1.0]), tube, {1: "vessel"})

@@ -50,7 +50,7 @@ class Lumen:
         return np.asarray((self.radii**2).mean(axis=1) * math.pi)
 
     def compute_rings(self, fractions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(S, F, DIRECTIONS, 3) m: points at F fractions of the wall's distance."""
+        """Compute (S, F, DIRECTIONS, 3) m: points at F fractions of the wall's distance."""
         return np.asarray(
             self.centres[:, None, None] + fractions[:, None, None] * self._wall[:, None]
         )
@@ -64,7 +64,7 @@ class Lumen:
     def locate_points(
         self, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Place along the stations (P,), and offset (P, 2) across the tube from its middle.
+        """Return the place along the stations (P,), and the offset (P, 2) across the tube.
 
         The offset is that over the wall's distance in its direction, so that its length is the
         radial coordinate. Beyond its ends the tube goes on straight, with its last station's place.
@@ -92,7 +92,7 @@ class Lumen:
 
 
 def measure_lumen(lumen: NDArray[np.bool_], index_to_patient: NDArray[np.float64]) -> Lumen:
-    """The sections of a vessel from the voxels of its lumen.
+    """Measure the sections of a vessel from the voxels of its lumen.
 
     Where it reaches the edge of the volume it is taken to go on beyond that.
 
@@ -168,7 +168,7 @@ class _Walls:
         self._drawn_in = 0.5 * (_SOFTENED**2 + _INTERPOLATED) * voxel**2
 
     def are_in_volume(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(P,) whether points (P, 3) m lie among the voxels, and in the lumen."""
+        """Return (P,) True for points (P, 3) m that lie among the voxels, and in the lumen."""
         index = self._index(points)
         among = ((index >= -0.5) & (index <= self._last)).all(axis=-1)
         return np.asarray(among & (self._at(index) > 0.5))
@@ -176,7 +176,7 @@ class _Walls:
     def distances(
         self, points: NDArray[np.float64], directions: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """(P, D) m from points (P, 3) m along unit directions (P, D, 3); inf without one."""
+        """Return (P, D) m from points (P, 3) m along directions (P, D, 3); inf without a wall."""
         rays = points[:, None, None] + self._steps[:, None] * directions[:, :, None]
         inside = self._at(self._index(rays))
         outside = inside < 0.5
@@ -203,7 +203,7 @@ class _Walls:
 
 
 def _sections(points: NDArray[np.float64], walls: _Walls, *, closed: bool = True) -> Lumen:
-    """Sections at the points (S, 3) m of a centre line.
+    """Measure sections at the points (S, 3) m of a centre line.
 
     Raises:
         VolumeError: one is not closed, and shall be.
@@ -225,7 +225,7 @@ def _sections(points: NDArray[np.float64], walls: _Walls, *, closed: bool = True
 
 
 def _frames(tangents: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(S, 2, 3) unit vectors across tangents (S, 3), turned as little as possible in between."""
+    """Return (S, 2, 3) unit vectors across tangents (S, 3), turned as little as possible."""
     across = np.empty((len(tangents), 2, 3))
     first = np.eye(3)[np.argmin(np.abs(tangents[0]))]
     for s, tangent in enumerate(tangents):
@@ -236,7 +236,7 @@ def _frames(tangents: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _extended(points: NDArray[np.float64], walls: _Walls, spacing: float) -> NDArray[np.float64]:
-    """The curve, straight on at both ends as far as it lies in the lumen and the volume."""
+    """Extend the curve straight at both ends as far as lumen and volume reach."""
     ends = []
     for inner, end in ((points[1], points[0]), (points[-2], points[-1])):
         step = (end - inner) * (spacing / np.linalg.norm(end - inner))
@@ -247,7 +247,7 @@ def _extended(points: NDArray[np.float64], walls: _Walls, spacing: float) -> NDA
 
 
 def _between(values: NDArray[np.float64], station: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values (S, …) at places (P,) between stations, linear."""
+    """Interpolate values (S, …) at places (P,) between stations."""
     low = np.minimum(station.astype(int), len(values) - 2)
     part = (station - low).reshape(-1, *[1] * (values.ndim - 1))
     return np.asarray(values[low] * (1.0 - part) + values[low + 1] * part)
@@ -275,7 +275,7 @@ class Centreline:
 
 
 def find_centreline(lumen: NDArray[np.bool_], index_to_patient: NDArray[np.float64]) -> Centreline:
-    """The centre line of the voxels of a lumen.
+    """Find the centre line of the voxels of a lumen.
 
     Args:
         lumen: (i, j, k), True in the vessel.
@@ -317,9 +317,11 @@ def find_centreline(lumen: NDArray[np.bool_], index_to_patient: NDArray[np.float
 def resample_curve(
     points: NDArray[np.float64], spacing: float, smoothing: float = 0.0
 ) -> NDArray[np.float64]:
-    """(Q, 3) m: a curve (P, 3) smoothed, with points about ``spacing`` apart, evenly.
+    """Smooth a curve (P, 3) m; return points (Q, 3) m, evenly about ``spacing`` apart.
 
     Args:
+        points: (P, 3) m.
+        spacing: m.
         smoothing: m, standard deviation of the averaging along the curve. Its ends stay.
 
     Raises:
@@ -375,7 +377,7 @@ def _graph(
 def _require_no_branch(
     voxels: NDArray[np.int64], places: NDArray[np.float64], slices: NDArray[np.int64]
 ) -> None:
-    """Each slice but those of the ends is one connected part."""
+    """Refuse a slice, but at the ends, that is not one connected part."""
     from scipy.ndimage import label
 
     last = slices.max()

@@ -63,7 +63,7 @@ class CarriedLumen:
         self.rest = self.deform_lumen(self._rest_nodes)
 
     def deform_lumen(self, nodes: NDArray[np.float64]) -> DeformedLumen:
-        """The lumen with the tissue's nodes at ``nodes`` (N, 3) m."""
+        """Return the lumen with the tissue's nodes at ``nodes`` (N, 3) m."""
         tangents, polygons = self._measured(nodes)
         within = self._rest_areas[:, None] * _FRACTIONS[1:] ** 2
         within *= np.maximum(polygons, 0.0) / self._rest_polygons
@@ -75,7 +75,7 @@ class CarriedLumen:
     def _measured(
         self, nodes: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Tangents (S, 3), and areas (S, rings) m² of the polygons across them."""
+        """Measure tangents (S, 3), and areas (S, rings) m² of the polygons across them."""
         stations = len(self._rest_areas)
         tangents, polygons = np.empty((stations, 3)), np.empty((stations, _RINGS))
         moved = np.ascontiguousarray(nodes, dtype=np.float64) - self._rest_nodes
@@ -85,9 +85,9 @@ class CarriedLumen:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _measure(points, nodes, weights, moved, tangents, polygons):
-    """Fills tangents (S, 3) and polygons (S, rings).
+    """Fill tangents (S, 3) and polygons (S, rings).
 
-    Args:
+    Shapes and units:
         points: (S * (rings + 1) * directions, 3) m, at rest; the first ring is the centre.
         nodes, weights: (points, 4), of the tetrahedron that each goes with.
         moved: (N, 3) m, displacements of the nodes.
@@ -145,7 +145,7 @@ class LumenMap:
 
 
 def load_lumen_map(volume: Volume, label: int) -> tuple[Lumen, LumenMap]:
-    """The lumen of a label, and the map of the voxels around it; from the cache if it is there.
+    """Load or measure the lumen of a label, and the map of the voxels around it.
 
     Raises:
         VolumeError: as `measure_lumen`.
@@ -230,7 +230,7 @@ class Vessel:
 
     @property
     def flow(self) -> float:
-        """m³/s along the vessel at the moment of the latest `advance`, averaged over the pulse."""
+        """m³/s along the vessel at the time of the latest `advance_to`, averaged over the pulse."""
         return self._flow
 
     @property
@@ -239,7 +239,7 @@ class Vessel:
         return self._now.areas
 
     def find_flow_sign(self, settings: FlowSettings) -> float:
-        """1 if blood flows from the first station to the last, -1 for the other way.
+        """Return 1 if blood flows from the first station to the last, -1 for the other way.
 
         Raises:
             SceneError: the direction is across the vessel.
@@ -257,7 +257,7 @@ class Vessel:
         return 1.0 if cosine > 0.0 else -1.0
 
     def apply_settings(self, settings: FlowSettings) -> None:
-        """Use other settings from now on; blood that has filled up stays.
+        """Apply other settings from now on; blood that has filled up stays.
 
         Raises:
             SceneError: as `find_flow_sign`.
@@ -279,7 +279,7 @@ class Vessel:
         self._find_axis_velocity()
 
     def advance_to(self, time: float, nodes: NDArray[np.float64] | None) -> None:
-        """Go on to a time (s), with the mesh's nodes (N, 3) m there; None: without tissue."""
+        """Advance to a time (s), with the mesh's nodes (N, 3) m there; None: without tissue."""
         self._now = self._carried.rest
         if nodes is not None and self._mesh is not None:
             self._now = self._carried.deform_lumen(nodes)
@@ -288,11 +288,11 @@ class Vessel:
         self._find_axis_velocity()
 
     def evaluate_pulse(self, time: ArrayLike) -> NDArray[np.float64]:
-        """Flow over its average over the pulse, at times (any shape) s."""
+        """Return the flow over its average over the pulse, at times (any shape) s."""
         return self._waveform(time)
 
     def _find_axis_velocity(self) -> None:
-        """Velocity (S, 3) m/s on the axis at each station, so that the flow is the same at all."""
+        """Find the velocity (S, 3) m/s on the axis that makes the flow the same at all stations."""
         filled = np.maximum(self._now.filled, 1e-12)
         speed = np.where(self._now.filled > 1e-12, self._sign * self._flow / filled, 0.0)
         #: (S, 3) m/s, on the axis at each station, averaged over the pulse.
@@ -309,7 +309,7 @@ and what is left of the flow not to be seen."""
 
 
 def compute_open_fraction(area: NDArray[np.float64], closed_at: float) -> NDArray[np.float64]:
-    """Open fraction of a lumen, from its area over that at rest and the fraction at closure."""
+    """Return the open part of a lumen, from its area over that at rest and that at closure."""
     return np.asarray(np.maximum(area - closed_at, 0.0) / (1.0 - closed_at))
 
 
@@ -364,7 +364,7 @@ class Circulation:
         return self._pressure
 
     def compute_flow(self, time: float, areas: NDArray[np.float64]) -> float:
-        """Flow averaged over the pulse, m³/s, at a time (s), with areas (S,) m² since the last.
+        """Return m³/s averaged over the pulse, at a time (s), with areas (S,) m² since the last.
 
         Where time goes back, as when a recording begins again, the reservoir is as at rest.
         """
@@ -417,7 +417,7 @@ class Waveform:
             self._base = 1.0 - self._swing * mean
 
     def __call__(self, time: ArrayLike) -> NDArray[np.float64]:
-        """Flow over its mean at times (any shape) s; beat and breath begin at 0."""
+        """Return flow over its mean at times (any shape) s; beat and breath begin at 0."""
         seconds = np.asarray(time, dtype=np.float64)
         beat = np.mod(seconds * self._heart, 1.0)
         if self._is_arterial:
@@ -428,7 +428,7 @@ class Waveform:
 
 
 def _triphasic(beat: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The arterial pulse's shape at fractions of a beat, 0 to 1; its peak is about 1."""
+    """Return the arterial pulse's shape at fractions of a beat, 0 to 1; its peak is about 1."""
     shape = np.zeros_like(beat)
     for middle, width, height in _BELLS:
         apart = np.mod(beat - middle + 0.5, 1.0) - 0.5  # the bell of the beat before, or after

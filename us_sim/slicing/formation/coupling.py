@@ -87,10 +87,12 @@ class ContactSurface:
     def measure_contact(
         self, nodes: ArrayLike, probe: Probe, pose: Pose
     ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """How each line meets the surface.
+        """Measure the coupling of each line, and its gap to the surface.
 
         Args:
             nodes: (N, 3) m, where the surface's nodes are now.
+            probe: its geometry.
+            pose: of the probe.
 
         Returns:
             (lines,) the fraction of an echo's amplitude transmitted: 0 in air, 1 in full contact;
@@ -109,10 +111,12 @@ class ContactSurface:
     def measure_gaps(
         self, nodes: ArrayLike, probe: Probe, pose: Pose
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Gap between face and surface along each line, and how far the face is pressed in there.
+        """Measure the gap between face and surface along each line, and the press there.
 
         Args:
             nodes: (N, 3) m, where the surface's nodes are now.
+            probe: its geometry.
+            pose: of the probe.
 
         Returns:
             (lines,) m, not positive where the face lies in the surface or within it, infinite
@@ -129,7 +133,7 @@ class ContactSurface:
                 f"{now.shape} coordinates came"
             )
         gap, press = np.empty(probe.lines), np.empty(probe.lines)
-        _meet(
+        _find_entries(
             now, self.rest_nodes, self._triangles, np.ascontiguousarray(pose.rotation),
             np.array(pose.position), probe.beam_starts, probe.beam_directions, gap, press,
         )  # fmt: skip
@@ -137,19 +141,19 @@ class ContactSurface:
 
 
 def _smooth(ramp: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The ramp clipped to 0 and 1 without a kink at either (the smoothstep polynomial)."""
+    """Clip a ramp to 0 and 1 without a kink at either (the smoothstep polynomial)."""
     ramp = np.clip(ramp, 0.0, 1.0)
     return ramp * ramp * (3.0 - 2.0 * ramp)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _meet(nodes, rest, triangles, rotation, position, starts, directions, gap, press):
-    """Entry of each beam into the surface: last before a face that is inside, else first after.
+def _find_entries(nodes, rest, triangles, rotation, position, starts, directions, gap, press):  # noqa: PLR0913
+    """Find where each beam enters: last before a face that is inside, else first after it.
 
     Folds of a surface that was pushed hard overlap. So the face is inside if the beam entered the
     surface more often than it left it, whatever it did last.
 
-    Args:
+    Shapes and units:
         nodes, rest: (N, 3); triangles (T, 3), normals outward.
         rotation: (3, 3) from frame ``probe``; position (3,).
         starts, directions: (lines, 2).
@@ -210,33 +214,41 @@ def _meet(nodes, rest, triangles, rotation, position, starts, directions, gap, p
         )
         normal_x = uy * vz - uz * vy
         normal_z = ux * vy - uy * vx
-        for line in range(lines):
-            x0, z0 = starts[line, 0], starts[line, 1]
-            x, z = directions[line, 0], directions[line, 1]
-            a = (ends[0, 0] - x0) * z - (ends[0, 1] - z0) * x
-            b = (ends[1, 0] - x0) * z - (ends[1, 1] - z0) * x
-            if (a >= 0.0) == (b >= 0.0):
-                continue
-            fraction = a / (a - b)
-            distance = (ends[0, 0] + fraction * (ends[1, 0] - ends[0, 0]) - x0) * x + (
-                ends[0, 1] + fraction * (ends[1, 1] - ends[0, 1]) - z0
-            ) * z
-            along = (ends[0, 2] + fraction * (ends[1, 2] - ends[0, 2])) * x + (
-                ends[0, 3] + fraction * (ends[1, 3] - ends[0, 3])
-            ) * z
-            inward = normal_x * x + normal_z * z < 0.0
-            if distance <= 0.0:
-                depth[line] += 1 if inward else -1
-                if inward and distance > entered[line]:
-                    entered[line] = distance
-                    moved[line] = along
-            elif inward and distance < gap[line]:
-                gap[line] = distance
-                press[line] = along - distance
+        _meet_lines(ends, normal_x, normal_z, starts, directions, depth, entered, moved, gap, press)
     for line in range(lines):
         if depth[line] > 0:
             gap[line] = entered[line]
             press[line] = moved[line] - entered[line]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _meet_lines(  # noqa: PLR0913
+    ends, normal_x, normal_z, starts, directions, depth, entered, moved, gap, press
+):
+    """Count where lines enter or leave by a triangle's cut, and keep the nearest entries."""
+    for line in range(len(starts)):
+        x0, z0 = starts[line, 0], starts[line, 1]
+        x, z = directions[line, 0], directions[line, 1]
+        a = (ends[0, 0] - x0) * z - (ends[0, 1] - z0) * x
+        b = (ends[1, 0] - x0) * z - (ends[1, 1] - z0) * x
+        if (a >= 0.0) == (b >= 0.0):
+            continue
+        fraction = a / (a - b)
+        distance = (ends[0, 0] + fraction * (ends[1, 0] - ends[0, 0]) - x0) * x + (
+            ends[0, 1] + fraction * (ends[1, 1] - ends[0, 1]) - z0
+        ) * z
+        along = (ends[0, 2] + fraction * (ends[1, 2] - ends[0, 2])) * x + (
+            ends[0, 3] + fraction * (ends[1, 3] - ends[0, 3])
+        ) * z
+        inward = normal_x * x + normal_z * z < 0.0
+        if distance <= 0.0:
+            depth[line] += 1 if inward else -1
+            if inward and distance > entered[line]:
+                entered[line] = distance
+                moved[line] = along
+        elif inward and distance < gap[line]:
+            gap[line] = distance
+            press[line] = along - distance
 
 
 _THICKEST = 5e-3  # m, of a layer that is filled: what is more is not the mesh's coarseness
@@ -266,9 +278,10 @@ class GelLayer:
     def fill_gap(
         self, image: NDArray[np.uint8], gap: NDArray[np.float64], coupling: NDArray[np.floating]
     ) -> NDArray[np.uint8]:
-        """The slice (rows, columns) with the layer filled; the slice itself where there is none.
+        """Fill the layer of a slice (rows, columns); return the slice itself where there is none.
 
         Args:
+            image: (rows, columns).
             gap: (lines,) m, from the face to the surface of the mesh along each line.
             coupling: (lines,); lines without stay as they are.
         """
@@ -283,10 +296,10 @@ class GelLayer:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _mirror(image, row, column, line, distance, along, thick, margin, out):
-    """Sets pixels of out (rows, columns) that lie in the layer, thick (lines,) m, if not negative.
+def _mirror(image, row, column, line, distance, along, thick, margin, out):  # noqa: PLR0913
+    """Set pixels of out (rows, columns) in the layer, thick (lines,) m where not negative.
 
-    Args:
+    Shapes and units:
         row, column, line, distance: (P,) of the pixels, and where they are on their beams (m).
         along: (2, P), columns and rows per metre along these.
         margin: m, by which the layer counts as thicker.
@@ -354,7 +367,7 @@ class Reverberation:
     def apply_coupling(
         self, image: NDArray[np.uint8], coupling: NDArray[np.float32]
     ) -> NDArray[np.uint8]:
-        """Echo levels (rows, columns) as lines of this coupling (lines,) show them."""
+        """Return echo levels (rows, columns) as lines of this coupling (lines,) show them."""
         if coupling.min() >= 1.0:
             return image
         coupled = np.interp(self._line, np.arange(len(coupling)), coupling)
@@ -367,7 +380,7 @@ class Reverberation:
 
 
 def _losses() -> NDArray[np.uint32]:
-    """(`_FINEST` + 1,) grey values lost, there and back, at evenly spaced amplitude fractions."""
+    """Return (`_FINEST` + 1,) grey values lost, there and back, at even amplitude fractions."""
     fraction = np.maximum(np.arange(_FINEST + 1), 0.1) / _FINEST
     lost = np.round(-40.0 * np.log10(fraction) * _GREYS_PER_DECIBEL)
     return np.minimum(lost, _SILENT).astype(np.uint32)
@@ -377,7 +390,7 @@ _LOSSES = _losses()
 
 
 def _apertures(probe: Probe) -> NDArray[np.int64]:
-    """(`_STEPS`,) length of the face, in places, that forms a line at each step of depth."""
+    """Return (`_STEPS`,) lengths of face, in places, that form a line at each step of depth."""
     length = np.linalg.norm(np.diff(probe.beam_starts, axis=0), axis=1).sum()
     length = max(length * probe.lines / max(probe.lines - 1, 1), 1e-6)
     depth = (np.arange(_STEPS) + 0.5) * (probe.depth / _STEPS)
@@ -387,7 +400,7 @@ def _apertures(probe: Probe) -> NDArray[np.int64]:
 
 
 def _air_echoes(probe: Probe, first: float) -> NDArray[np.uint8]:
-    """(rows, columns) levels of the image of a face in air, its first band at ``first`` dB."""
+    """Return (rows, columns) levels of a face in air, its first band at ``first`` dB."""
     line, depth = np.nan_to_num(probe.pixel_beams)
     # Elements differ a little, in the same manner in every frame.
     random = np.random.Generator(np.random.PCG64(7))
@@ -410,9 +423,9 @@ def _air_echoes(probe: Probe, first: float) -> NDArray[np.uint8]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _lose(coupled, reach, losses, out):
-    """The losses of tissue and of the face's own echo, at each step of depth and place of the face.
+    """Fill the losses of tissue and of the face's own echo, at each step of depth and place.
 
-    Args:
+    Shapes and units:
         coupled: (places,) fraction of the amplitude transmitted in one direction.
         reach: (steps,) places on either side whose elements form a line.
         out: (steps, places), set: the tissue's loss, and that of the face's echo times 256.
@@ -435,7 +448,7 @@ def _lose(coupled, reach, losses, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _brighter(image, air, place, losses, out):
-    """The brighter of tissue and air (flat), each less its loss at its place."""
+    """Fill out with the brighter of tissue and air (flat), each less its loss at its place."""
     for i in range(len(image)):
         loss = losses[place[i]]
         tissue = np.int32(image[i]) - np.int32(loss & 255)

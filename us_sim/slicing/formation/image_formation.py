@@ -77,13 +77,14 @@ class ImageFormation:
 
     @property
     def needs_contact(self) -> bool:
-        """Whether `form_picture` asks how each line meets the skin."""
+        """True if `form_picture` needs the contact of each line with the skin."""
         return self._reverberation is not None
 
     def make_planes(self, pose: Pose, plane: SlicePlane | None = None) -> list[SlicePlane]:
-        """The planes to cut with the probe at ``pose``, from the lowest y of the probe on.
+        """Make the planes to cut with the probe at ``pose``, from the lowest y of the probe on.
 
         Args:
+            pose: of the probe.
             plane: the probe's own at that pose, where it is there already.
 
         Raises:
@@ -108,10 +109,10 @@ class ImageFormation:
         gap: NDArray[np.float64] | None = None,
         heard: Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None = None,
     ) -> NDArray[np.uint8]:
-        """The picture (rows, columns); the first image itself when nothing is to be done.
+        """Form the picture (rows, columns); return the first image itself if nothing is to be done.
 
         Args:
-            images: the slices on `planes`, (rows, columns) each.
+            images: the slices on `make_planes`, (rows, columns) each.
             coupling: (lines,) from 0 in air to 1 in full contact; None is full contact.
             gap: (lines,) m, from the face to what carries the volume; None is none.
             heard: makes of echoes (rows, columns) what is left of them on their way; None is all.
@@ -168,7 +169,7 @@ class GreyMapping:
         self._tables = np.floor(255.0 * ramp + (0.5 + 1e-9)).astype(np.uint8)
 
     def map_levels(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The grey values (rows, columns) of echo levels (rows, columns)."""
+        """Map echo levels (rows, columns) to grey values (rows, columns)."""
         out = np.empty_like(image)
         if self._steps is None:
             _look_up(image.reshape(-1), self._tables[0], out.reshape(-1))
@@ -186,7 +187,7 @@ def _look_up(image, table, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _look_up_by_step(image, steps, tables, out):
-    """Fills out; the tables of 256 entries lie one after the other."""
+    """Fill out; the tables of 256 entries lie one after the other."""
     for i in range(len(image)):
         out[i] = tables[np.uint32(steps[i]) << np.uint32(8) | np.uint32(image[i])]
 
@@ -221,7 +222,7 @@ class Elevation:
         self._weights = np.ascontiguousarray(fixed.T)[:, find_depth_steps(probe)]
 
     def average_planes(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-        """The weighted mean (rows, columns) of the images (rows, columns) on the planes."""
+        """Return the weighted mean (rows, columns) of the images (rows, columns) on the planes."""
         total = np.full(images[0].size, _WHOLE // 2, dtype=np.uint32)
         for image, weights in zip(images, self._weights, strict=True):
             _add_weighted(image.reshape(-1), weights.reshape(-1), total)
@@ -232,7 +233,7 @@ class Elevation:
 def _matched_weights(
     offsets: NDArray[np.float64], sigma: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(depths, planes) that sum to 1 and have the variance sigma² (depths,) about 0.
+    """Return weights (depths, planes) that sum to 1 and have the variance sigma² (depths,).
 
     Two planes have the variance of their distance, whatever their weights.
     """
@@ -253,7 +254,7 @@ def _gaussian(squares: NDArray[np.float64], sigma: NDArray[np.float64]) -> NDArr
 
 
 def _fixed_point(weights: NDArray[np.float64]) -> NDArray[np.uint16]:
-    """The weights in fixed point, symmetric and with the exact sum: even tissue stays even."""
+    """Return weights in fixed point, symmetric and with the exact sum: even tissue stays even."""
     half = weights.shape[1] // 2
     outer = np.round(weights[:, :half] * _WHOLE).astype(np.int64)
     if weights.shape[1] % 2:

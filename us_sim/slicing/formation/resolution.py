@@ -37,8 +37,8 @@ class Resolution:
     """Spreads echoes across and along the beams.
 
     Across them the width is ``lateral_resolution`` at the focus and grows away from it as
-    `beams.compute_beam_width` says; along them it is ``axial_resolution`` at the face and grows by a tenth
-    of that each centimetre.
+    `beams.compute_beam_width` says; along them it is ``axial_resolution`` at the face and grows by
+    a tenth of that each centimetre.
 
     Where beams are parallel, an image's columns and rows serve as lines and samples. A fan is
     resampled to lines and samples so close that no pixel falls between them, and back.
@@ -62,7 +62,7 @@ class Resolution:
         self._along = _point_spreads(along, samples - 1)
 
     def spread_echoes(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The image (rows, columns) of echo levels as the probe resolves it."""
+        """Return the image (rows, columns) of echo levels as the probe resolves it."""
         beams = image if self._fan is None else self._fan.resample_to_beams(image)
         power = np.empty(beams.shape, dtype=np.float32)
         _spread_across(beams, _POWERS, *self._across, power)
@@ -113,11 +113,11 @@ class _Fan:
         )
 
     def resample_to_beams(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(samples, lines) of an image (rows, columns)."""
+        """Resample an image (rows, columns) to (samples, lines)."""
         return _remapped(image, self._to_beams, replicate=True)
 
     def resample_to_pixels(self, beams: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The image (rows, columns) of (samples, lines), black where no beam reaches."""
+        """Resample (samples, lines) to an image (rows, columns), black where no beam reaches."""
         return _remapped(beams, self._to_pixels, replicate=False)
 
 
@@ -139,7 +139,7 @@ def _length(points: NDArray[np.float64]) -> float:
 def _point_spreads(
     widths: NDArray[Any], most: int
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Gaussian weights of full widths at half maximum (n,) in steps, and how far each reaches.
+    """Return Gaussian weights of full widths at half maximum (n,) in steps, and their reach.
 
     Returns:
         (n, reach + 1) weights of a step and those on either side of it, which sum to 1; (n,).
@@ -155,14 +155,14 @@ def _point_spreads(
 
 
 def _powers() -> NDArray[np.float32]:
-    """(256,) the power of each grey value, 1 for 255 and nothing for 0."""
+    """Return (256,) the power of each grey value, 1 for 255 and nothing for 0."""
     power = 10.0 ** ((np.arange(256) / 255.0 - 1.0) * ECHO_RANGE / 10.0)
     power[0] = 0.0
     return power.astype(np.float32)
 
 
 def _levels() -> NDArray[np.uint8]:
-    """(`_FINEST` + 1,) the grey value of each evenly spaced amplitude from 0 to 1."""
+    """Return (`_FINEST` + 1,) the grey value of each evenly spaced amplitude from 0 to 1."""
     amplitude = np.maximum(np.arange(_FINEST + 1), 0.25) / _FINEST
     level = 255.0 * (1.0 + 20.0 * np.log10(amplitude) / ECHO_RANGE)
     return np.clip(np.floor(level + 0.5), 0, 255).astype(np.uint8)
@@ -200,7 +200,7 @@ def _spread_across(image, powers, weights, reach, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _spread_along(power, weights, reach, levels, out):
-    """Power (rows, lines) spread across rows, as grey values to ``out``."""
+    """Spread power (rows, lines) across rows; write it as grey values to ``out``."""
     rows, lines = power.shape
     line = np.empty(lines, dtype=np.float32)
     finest = np.float32(len(levels) - 1)

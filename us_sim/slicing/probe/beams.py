@@ -26,12 +26,12 @@ DEPTH_STEPS = 512  # steps of depth in which tables of what changes with depth a
 
 
 def get_focus(probe: Probe) -> float:
-    """Depth of the focus along the beams, m; half the image's depth where the probe has none."""
+    """Return the depth of focus along the beams, m; half the image's where the probe has none."""
     return 0.5 * probe.depth if probe.focus is None else probe.focus
 
 
 def compute_beam_width(depth: ArrayLike, width: float, focus: float) -> NDArray[Any]:
-    """Width of a beam at depths (any shape) m, that is ``width`` at its focus.
+    """Compute the width of a beam at depths (any shape) m, that is ``width`` at its focus.
 
     It grows on both sides as that of a Gaussian beam, here √2 times at the face and at twice the
     focal depth: the range of an aperture that is weakly focused.
@@ -40,19 +40,19 @@ def compute_beam_width(depth: ArrayLike, width: float, focus: float) -> NDArray[
 
 
 def compute_step_depths(probe: Probe) -> NDArray[Any]:
-    """(`DEPTH_STEPS`,) m: the depth along the beams in the middle of each step."""
+    """Return (`DEPTH_STEPS`,) m: the depth along the beams in the middle of each step."""
     return np.asarray((np.arange(DEPTH_STEPS) + 0.5) * (probe.depth / DEPTH_STEPS))
 
 
 def find_depth_steps(probe: Probe) -> NDArray[np.uint16]:
-    """(rows, columns): the step of depth that each pixel lies in; 0 where no beam reaches."""
+    """Return (rows, columns): the step of depth of each pixel; 0 where no beam reaches."""
     step = probe.pixel_beams[1] * np.float32(DEPTH_STEPS / probe.depth)
     np.nan_to_num(step, copy=False)
     return np.clip(step, 0, DEPTH_STEPS - 1, out=step).astype(np.uint16)
 
 
 def require_depth(probe: Probe, key: str, depth: float | None, what: str) -> float:
-    """The depth, m, or half of the image's where none is given.
+    """Return the depth, m, or half of the image's where none is given.
 
     Raises:
         ProbeError: it lies outside the image.
@@ -68,7 +68,7 @@ def require_depth(probe: Probe, key: str, depth: float | None, what: str) -> flo
 
 
 def require_steering(probe: Probe, key: str, steering: float) -> None:
-    """Check that a probe can steer its beams.
+    """Refuse to steer a probe that cannot.
 
     Raises:
         ProbeError: its beams spread, and it shall.
@@ -80,7 +80,7 @@ def require_steering(probe: Probe, key: str, steering: float) -> None:
 def compute_beam_angles(
     probe: Probe, fraction: NDArray[Any], steering: float = 0.0
 ) -> NDArray[np.float64]:
-    """Angles (as ``fraction``) rad of the beams there from the probe's z towards its x."""
+    """Return angles (as ``fraction``) rad of the beams there from the probe's z towards its x."""
     directions = probe.beam_directions
     angles = np.arctan2(directions[:, 0], directions[:, 1])
     return np.asarray(_interpolate_lines(probe, fraction, angles) + steering)
@@ -89,9 +89,10 @@ def compute_beam_angles(
 def convert_to_pixels(
     probe: Probe, fraction: NDArray[Any], depth: NDArray[Any], steering: float = 0.0
 ) -> NDArray[np.float64]:
-    """(P, 2) column and row, with fractions of pixels, of places (P,) along beams.
+    """Convert places (P,) along beams to (P, 2) fractional column and row.
 
     Args:
+        probe: whose beams they are.
         fraction: of the beam's start.
         depth: m, along the beam.
         steering: rad, of all beams.
@@ -104,7 +105,7 @@ def convert_to_pixels(
 
 
 def compute_beam_coordinates(probe: Probe) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Fraction of the face and depth (m) of each pixel (rows, columns); NaN where no beam reaches.
+    """Return face fraction and depth (m) of each pixel (rows, columns); NaN beside the beams.
 
     Beams are not steered.
     """
@@ -115,7 +116,7 @@ def compute_beam_coordinates(probe: Probe) -> tuple[NDArray[np.float32], NDArray
 def _interpolate_lines(
     probe: Probe, fraction: NDArray[Any], of_lines: NDArray[np.float64]
 ) -> NDArray[Any]:
-    """Values of lines, linear between them and on beyond the outermost two."""
+    """Interpolate values of lines linearly, and on beyond the outermost two."""
     if probe.lines == 1:
         return np.full(np.shape(fraction), of_lines[0])
     line = (np.asarray(fraction) + 0.5) * probe.lines - 0.5

@@ -70,7 +70,7 @@ class SlicePlane:
         return np.ascontiguousarray(np.column_stack([inverse, -inverse @ self.origin]))
 
     def make_shown_mask(self) -> NDArray[np.bool_]:
-        """(rows, columns): which pixels show something."""
+        """Return (rows, columns): True for pixels that show something."""
         if self.spans is None:
             return np.ones((self.rows, self.columns), dtype=np.bool_)
         column = np.arange(self.columns)[None, :]
@@ -78,14 +78,14 @@ class SlicePlane:
         return np.asarray(((column[:, None] >= first) & (column[:, None] < end)).any(axis=1))
 
     def compute_pixel_positions(self) -> NDArray[np.float64]:
-        """(rows, columns, 3) m: the position of every pixel centre."""
+        """Compute (rows, columns, 3) m: the position of every pixel centre."""
         column = np.arange(self.columns)[None, :, None]
         row = np.arange(self.rows)[:, None, None]
         return self.origin + column * self.column_step + row * self.row_step
 
 
 def _runs_within(spans: NDArray[np.int32], rows: int, columns: int) -> NDArray[np.int32]:
-    """The spans as kernels take them, checked here to lie within the image, as kernels do not."""
+    """Return the spans as kernels take them, once they are known to lie within the image."""
     runs = np.ascontiguousarray(spans, dtype=np.int32)
     if runs.shape != (rows, 2, 2) or runs.min() < 0 or runs.max() > columns:
         raise ProbeError(

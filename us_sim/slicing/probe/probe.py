@@ -98,7 +98,7 @@ class Probe(Settings, ABC):
     focus: float | None  # m, along the beams from the face
 
     def with_square_pixels(self, rows: int) -> Self:
-        """The probe with so many rows, and as many columns as make pixels square, to half a column.
+        """Return the probe with so many rows, and columns that make pixels square to half a column.
 
         Raises:
             ProbeError: the image is too large.
@@ -107,7 +107,7 @@ class Probe(Settings, ABC):
         return self.with_pixels(max(1, round(rows * draft.width / draft.height)), rows)
 
     def with_pixels(self, columns: int, rows: int) -> Self:
-        """The probe with an image of so many pixels.
+        """Return the probe with an image of so many pixels.
 
         Raises:
             ProbeError: the image is too large.
@@ -123,6 +123,7 @@ class Probe(Settings, ABC):
         return min(0.4, math.floor(within * 200) / 200)
 
     def get_upper_limit(self, name: str) -> float:
+        """Return the largest value of a setting; the greatest depth for ``depth``."""
         return self.greatest_depth if name == "depth" else super().get_upper_limit(name)
 
     @property
@@ -134,7 +135,7 @@ class Probe(Settings, ABC):
     def _beam(
         self, x: NDArray[np.float64], z: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The beams through points (m): their place among all lines, 0 to 1, and the distance (m).
+        """Return the place of beams through points (m) among all lines, 0 to 1, and distance (m).
 
         The distance is along the beam from the face. Where no beam reaches, one of the two is out
         of its range.
@@ -144,7 +145,7 @@ class Probe(Settings, ABC):
     def compute_rays(
         self, part: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Start (n, 2) m and unit direction (n, 2), as x and z, of beams, also between the lines.
+        """Return start (n, 2) m and unit direction (n, 2), x and z, of beams, also between lines.
 
         Args:
             part: (n,) of the face, or of the opening angle where beams spread: 0 to 1.
@@ -224,7 +225,7 @@ class Probe(Settings, ABC):
         return _make_read_only(pixels.astype(np.float32))
 
     def make_plane(self, pose: Pose) -> SlicePlane:
-        """The pixels of the image taken with the probe at ``pose``, in the parent frame."""
+        """Return the pixels of the image taken with the probe at ``pose``, in the parent frame."""
         rotation = pose.rotation
         lateral, axial = self.pixel_spacing
         return SlicePlane(
@@ -244,7 +245,7 @@ class Probe(Settings, ABC):
     def _bands(
         self,
     ) -> Iterator[tuple[slice, NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]]:
-        """Bands of rows, with `_beam` of their pixels and which of these are reached.
+        """Yield bands of rows, with `_beam` of their pixels and which of these are reached.
 
         A few rows at a time, so that a large image does not need many times its own memory.
         """
@@ -324,19 +325,20 @@ class LinearProbe(Probe):
     def compute_rays(
         self, part: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return parallel beams, which start on the face."""
         starts = np.zeros((len(part), 2))
         starts[:, 0] = (part - 0.5) * self.aperture
         return starts, np.tile([0.0, 1.0], (len(part), 1))
 
 
 def _make_read_only(array: Any) -> Any:
-    """The array, made read-only, since all callers get the same."""
+    """Return the array, made read-only, since all callers get the same."""
     array.flags.writeable = False
     return array
 
 
 def _runs(shown: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """(rows, 2, 2): first and end column of up to two runs of each row of (rows, columns)."""
+    """Return (rows, 2, 2): first and end column of up to two runs of each row."""
     edges = np.diff(np.pad(shown, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     runs = np.zeros((len(shown), 2, 2), dtype=np.int32)
     for which, sign in enumerate((1, -1)):
@@ -387,6 +389,7 @@ class ConvexProbe(Probe):
     def compute_rays(
         self, part: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return beams along the radii of the arc, which start on it."""
         angle = (part - 0.5) * self.opening_angle
         directions = np.column_stack([np.sin(angle), np.cos(angle)])
         return self.radius * (directions - [0.0, 1.0]), directions
@@ -451,13 +454,14 @@ class SectorProbe(Probe):
     def compute_rays(
         self, part: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return beams that radiate from the apex, and start on the flat face."""
         angle = (part - 0.5) * self.opening_angle
         starts = np.column_stack([self.radius * np.tan(angle), np.zeros_like(angle)])
         return starts, np.column_stack([np.sin(angle), np.cos(angle)])
 
 
 def compute_image_outline(probe: Probe) -> NDArray[np.float64]:
-    """(66, 3) m in frame ``probe``: along the face, then back where the image ends.
+    """Return (66, 3) m in frame ``probe``: along the face, then back where the image ends.
 
     So the beam of point k ends at the point 65 - k.
     """
