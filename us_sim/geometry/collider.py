@@ -24,9 +24,6 @@ class _Shape(Settings):
 
     That is (4,) m: half extents x, y, z of the core box, and the rounding around it; (5,) where
     the core's front is curved, with its curvature, 1/m.
-
-    Raises:
-        ProbeError: a dimension is out of its range, or they do not go together.
     """
 
     section = "probe.collider"

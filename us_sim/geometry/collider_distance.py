@@ -50,13 +50,8 @@ def measure_distances(
     point is not unique, on the core itself, the normal is the probe's +z if that is one of the
     nearest directions.
 
-    Args:
-        collider: the shape, which lies in frame ``probe``.
-        pose: of the probe in the frame of the points.
-        points: (N, 3) m.
-
     Returns:
-        (N,) m, negative inside, and (N, 3) unit normals in the frame of the points.
+        (N,) m, negative inside, and (N, 3) unit normals, in the frame of pose and points (N, 3) m.
     """
     points = np.ascontiguousarray(points, dtype=np.float64)
     distance = np.empty(len(points))

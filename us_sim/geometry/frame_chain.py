@@ -23,11 +23,7 @@ _RESTART = 1_000_000_000  # ns that a stamp jumps back by when its source begins
 
 
 class PoseHistory:
-    """The last poses of a frame, by their stamps.
-
-    Args:
-        longest: ns, between two poses that are interpolated; None for any time.
-    """
+    """The last poses of a frame, by stamp; between two of them at most ``longest`` ns apart."""
 
     def __init__(self, *, longest: int | None = None) -> None:
         self._longest = longest
@@ -59,15 +55,11 @@ class PoseHistory:
 
 
 class FrameChain:
-    """The way from a frame up to another through transforms that come one by one.
+    """The links from a frame up to another, the top, whose poses come one by one.
 
     A pose is made at the latest time at which all links are known, as tf2 does: at the stamps of
     the link that comes last, and so mostly of that which moves least often. Each of the others is
     interpolated there, also where its stamps are ahead.
-
-    Args:
-        frame: whose pose is wanted.
-        top: the frame in which it is wanted.
     """
 
     def __init__(self, frame: str, top: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-# The four outward faces of a positively oriented tetrahedron.
+# The outward faces of a positively oriented tetrahedron; face f is opposite to corner f.
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 MOST_NODES = 2**21  # Most nodes of a mesh, so that the three of a face fit into one 64-bit number
 

@@ -13,11 +13,7 @@ from us_sim.errors import MeshError
 
 
 def read_with_meshio(path: Path, refusal: str) -> Any:
-    """Read a mesh by meshio.
-
-    Args:
-        path: of the file.
-        refusal: the error of a file that cannot be read.
+    """Read a mesh by meshio; ``refusal`` is the error of a file that cannot be read.
 
     Raises:
         MeshError: it cannot be read, a second file that goes with it is missing, or meshio or a

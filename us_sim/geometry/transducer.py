@@ -104,14 +104,10 @@ def build_transducer_mesh(collider: Collider) -> list[TransducerPart]:
     middle = top - _SHOULDER - 0.012
     # At -x, on the side of the image's first column: the mark is at the image's left.
     half_turn = np.array([-1.0, -1.0, 1.0])
-    notch = [
-        half_turn
-        * (
-            np.array([grip_x + high * scale, 0.0, middle])
-            + _turn_ring(_flat_ring(0, 0, wide, 0), size)
-        )
-        for scale, size in ((-0.8, (1.0, long / wide)), (0.2, (1.0, long / wide)), (1.0, (0.6, 3)))
-    ]
+    notch = []
+    for scale, size in ((-0.8, (1.0, long / wide)), (0.2, (1.0, long / wide)), (1.0, (0.6, 3))):
+        ring = _turn_ring(_flat_ring(0, 0, wide, 0), size)
+        notch.append(half_turn * (np.array([grip_x + high * scale, 0.0, middle]) + ring))
     return [
         _build_part("face", FACE, [*front, side, nose], has_front=False),
         _build_part("housing", HOUSING, housing),

@@ -23,12 +23,8 @@ _Real = TypeVar("_Real", np.float32, np.float64)
 def compute_vertex_normals(vertices: NDArray[_Real], triangles: ArrayLike) -> NDArray[_Real]:
     """Compute (N, 3) unit normals: sums of the adjacent triangles' normals weighted by area.
 
-    They point to the side from which the triangles turn anticlockwise. Where the sum is zero, so
-    is the normal.
-
-    Args:
-        vertices: (N, 3), float32 or float64; the normals have the same precision.
-        triangles: (T, 3) indices into vertices.
+    They point to the side from which the triangles (T, 3) turn anticlockwise, and have the
+    precision of the vertices (N, 3). Where the sum is zero, so is the normal.
     """
     normals = np.zeros(vertices.shape, dtype=vertices.dtype)
     whole = np.ascontiguousarray(vertices).view()

@@ -39,7 +39,7 @@ class BMode:
 
     Args:
         volume: in frame ``patient``.
-        probe: its geometry; may be set to another one later.
+        probe: its geometry; `apply_settings` exchanges it.
         imaging: the console's settings.
         acoustics: what sound meets along the beams; None for no more than the volume holds.
         method: how slices through deformed tissue are cut, see `us_sim.settings.registry.SLICERS`.
@@ -70,11 +70,6 @@ class BMode:
         self.apply_settings(probe, imaging or Imaging(), acoustics)
 
     @property
-    def probe(self) -> Probe:
-        """The probe in use."""
-        return self._probe
-
-    @property
     def skipped(self) -> int:
         """Inverted or flat tetrahedra that the latest slice left out."""
         return self._slicer.skipped if self._slicer else 0
@@ -82,17 +77,13 @@ class BMode:
     def apply_settings(
         self, probe: Probe, imaging: Imaging, acoustics: Acoustics | None = None
     ) -> None:
-        """Apply another probe, or other settings, from the next image on.
-
-        Raises:
-            ProbeError: as for the class.
-        """
+        """Apply another probe, or other settings, from the next image on."""
         self._acoustics = self._acoustics_of(probe, acoustics)
         if self._acoustics is not None:
             imaging = self._acoustics.resolve_imaging(imaging)
             if self._mesh is not None:
                 self._acoustics.attach_mesh(*self._mesh)
-        self._probe = probe
+        self.probe = probe
         self._formation = ImageFormation(probe, imaging)
 
     def prepare_settings(
@@ -172,7 +163,7 @@ class BMode:
         return Frame(
             pose,
             nodes,
-            self._probe,
+            self.probe,
             self._volume,
             slicer=self._slicer,
             formation=self._formation,
@@ -189,36 +180,21 @@ class BMode:
     def render_image(
         self, pose: Pose, nodes: NDArray[np.float64] | None = None
     ) -> NDArray[np.uint8]:
-        """Render the B-mode image (rows, columns) with the probe at ``pose``: `Frame.pixels`.
-
-        Raises:
-            MeshError, ProbeError, VolumeError: as for `make_frame`'s arguments and `Frame`.
-        """
+        """Render the B-mode image (rows, columns) with the probe at ``pose``: `Frame.pixels`."""
         return self.make_frame(pose, nodes).pixels
 
     def render_labels(
         self, pose: Pose, nodes: NDArray[np.float64] | None = None
     ) -> NDArray[np.uint8]:
-        """Render the volume's label at each pixel (rows, columns), 0 where there is nothing.
-
-        Raises:
-            MeshError, ProbeError, VolumeError: as for `Frame.render_labels`.
-        """
+        """Render the volume's label at each pixel (rows, columns), 0 where there is nothing."""
         return self.make_frame(pose, nodes).labels
 
     def measure_excess_depth(self, pose: Pose, *, pressed: bool = True) -> float:
-        """Return the m by which the middle beam reaches beyond the mesh at rest, or the volume.
-
-        Args:
-            pose: of the probe.
-            pressed: False is as if a probe in the mesh stood where its middle beam enters it.
-        """
+        """Return `measure_excess_depth` beyond the mesh at rest, or the volume without one."""
         extent = self._volume.extent
         if self._mesh is not None:
             extent = np.stack([self._mesh[0].min(axis=0), self._mesh[0].max(axis=0)])
-        return measure_excess_depth(
-            self._probe, pose, extent, pressed=pressed or self._mesh is None
-        )
+        return measure_excess_depth(self.probe, pose, extent, pressed=pressed or self._mesh is None)
 
     def _acoustics_of(self, probe: Probe, acoustics: Acoustics | None) -> BeamAcoustics | None:
         if acoustics is None or not acoustics.is_live:

@@ -35,7 +35,8 @@ class SweepPicture:
     ) -> None:
         #: Properties that pictures share whose columns can stand side by side.
         self.layout = rows, columns, sweep, scale
-        self._grey = np.zeros((rows, columns), np.uint8)
+        #: (rows, columns) without the scales; the newest column is the last.
+        self.grey = np.zeros((rows, columns), np.uint8)
         self._duration = sweep / columns
         self._last: int | None = None
         top, bottom, unit = scale
@@ -57,20 +58,15 @@ class SweepPicture:
             cv2.line(self._frame, (column, rows), (column, rows + 4), _SCALE, 1)
             label.draw_at(self._frame, max(0, column - label.width // 2), rows + 6)
 
-    @property
-    def grey(self) -> NDArray[np.uint8]:
-        """(rows, columns) without the scales; the newest column is the last."""
-        return self._grey
-
     def advance_to(self, time: float) -> NDArray[np.float64]:
         """Advance to ``time``; return the times (K,) s of the columns to be added.
 
         After time went back, or stood still for longer than the picture, it begins anew.
         """
         newest = math.floor(time / self._duration + _ROUNDING)
-        columns = self._grey.shape[1]
+        columns = self.grey.shape[1]
         if self._last is None or not self._last <= newest < self._last + columns:
-            self._grey[:] = 0
+            self.grey[:] = 0
             self._last = newest - 1
         numbers = np.arange(self._last + 1, newest + 1)
         self._last = newest
@@ -80,14 +76,14 @@ class SweepPicture:
         """Move the picture to the left and put these columns (rows, K) on its right."""
         count = columns.shape[1]
         if count:
-            self._grey[:, :-count] = self._grey[:, count:]
-            self._grey[:, -count:] = columns
+            self.grey[:, :-count] = self.grey[:, count:]
+            self.grey[:, -count:] = columns
 
     def draw_picture(self) -> NDArray[np.uint8]:
         """Draw a new picture of red, green and blue, with its scales."""
-        rows, columns = self._grey.shape
+        rows, columns = self.grey.shape
         picture = self._frame.copy()
-        picture[:rows, :columns] = self._grey[:, :, None]
+        picture[:rows, :columns] = self.grey[:, :, None]
         for row in self._marks:
             picture[row, :columns] = np.maximum(picture[row, :columns], np.uint8(90))
         return picture

@@ -69,9 +69,6 @@ class Imaging(Settings):
     """The settings of image formation; with the defaults the volume's grey values are shown.
 
     Each is a key of a scene's ``imaging:`` and a parameter of the node that makes the images.
-
-    Raises:
-        ProbeError: a value is out of range, with its name and the range.
     """
 
     section = "imaging"
@@ -134,11 +131,7 @@ _LENGTH = Quantity("length", 0.2e-3, 0.05)
 
 @dataclass(frozen=True)
 class StrainSettings(Settings):
-    """Strain images: the tissue's own, and an estimate made from two images as a scanner makes it.
-
-    Raises:
-        ProbeError: a value is out of range, with its name and the range.
-    """
+    """Strain images: the tissue's own, and a scanner's estimate from two images."""
 
     section = "strain"
     error = ProbeError
@@ -184,11 +177,7 @@ class StrainSettings(Settings):
 
 @dataclass(frozen=True)
 class MModeSettings(Settings):
-    """The line, and how long it is shown.
-
-    Raises:
-        ProbeError: a value is out of range.
-    """
+    """The line, and how long it is shown."""
 
     section = "m_mode"
     error = ProbeError

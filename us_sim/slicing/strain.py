@@ -81,13 +81,10 @@ def fill_nodal_deformation(  # noqa: PLR0913
         deformed: (M, 4) room for volume and c of tetrahedra. done: (M + N,) bool, room.
     """
     for n in range(len(now)):
+        x, y, z = now[n, 0], now[n, 1], now[n, 2]
         for a in range(3):
-            place[n, a] = (
-                to_pixel[a, 3]
-                + to_pixel[a, 0] * now[n, 0]
-                + to_pixel[a, 1] * now[n, 1]
-                + to_pixel[a, 2] * now[n, 2]
-            )
+            m = to_pixel[a]
+            place[n, a] = m[3] + m[0] * x + m[1] * y + m[2] * z
     done[:] = False
     count = len(tetrahedra)
     for s in shown:

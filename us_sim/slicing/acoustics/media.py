@@ -218,16 +218,12 @@ class BeamGrid:
         nearest, fractions = cv2.convertMaps(beam, sample, cv2.CV_16SC2)
         return np.asarray(nearest), np.asarray(fractions)
 
-    @property
-    def room(self) -> tuple[int, int]:
-        """Rows and columns of pixels that all samples and beams of a linear array are on."""
-        return self.samples * self.pixels[0], self.beams * self.pixels[1]
-
     def interpolate_to_pixels(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Interpolate values (samples, beams) at the pixels (rows, columns)."""
         rows, columns = self._shape
         if self._maps is None:
-            resized: Any = cv2.resize(values, self.room[::-1], interpolation=cv2.INTER_LINEAR)
+            size = self.beams * self.pixels[1], self.samples * self.pixels[0]
+            resized: Any = cv2.resize(values, size, interpolation=cv2.INTER_LINEAR)
             return np.asarray(resized)[:rows, :columns]
         remapped = cv2.remap(values, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(remapped)

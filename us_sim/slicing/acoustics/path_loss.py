@@ -78,24 +78,17 @@ def trace_beams(  # noqa: PLR0913
 ):  # fmt: skip
     """Fill gain, blocked and blocker; return the numbers of crossings and of clear samples.
 
-    Args:
-        elements: (pixels,) as `LocatedPixels.elements`, flat.
-        wide: elements a row.
-        steps: (2,) rows and columns of the image from one element to the next.
-        maps: as `LocatedPixels.maps`.
-        voxels: (I*J*K,) uint8 labels.
-        shape: (3,) I, J, K.
+    Shapes and units:
+        elements: (pixels,) as `LocatedPixels.elements`, flat, ``wide`` a row, every ``steps`` (2,)
+            rows and columns; maps: as there. voxels: (I*J*K,) uint8 labels, shape: (3,) its sides.
         places: (beams, samples) int32, of the element at each sample.
         lines: (beams, 4) column and row of the first sample, and from each to the next.
-        across: (beams,) float32, x of the beams' directions.
-        along: (beams,) float32, z of the beams' directions.
-        media: `Media`.
+        across, along: (beams,) float32, the beams' directions as x and z.
         time_gain: (samples,) float32 dB.
         fibre: (E + 1, directions, 2) float32, x and z of the unit fibres of each map.
         gain: (samples, beams) float32 dB, all but what blocks.
-        blocked: (samples, beams) float32 dB lost to what blocks.
-        blocker: (samples, beams) float32, mean sample at which that is lost.
-        crossings: `Crossings`.
+        blocked, blocker: (samples, beams) float32 dB lost to what blocks, and the mean sample at
+            which it is lost.
     """
     beams, samples = places.shape
     found = 0
@@ -291,15 +284,9 @@ def _find_border(ax, ay, az, bx, by, bz, s, was, now, voxels, sides, of_label): 
 @njit(inline="always", error_model="numpy")
 def _block(loss, s, hard, where):
     """Add a loss at sample ``s`` to the hard loss and to the mean sample of that."""
-    return hard + loss, _blocked_at(where, hard, loss, s)
-
-
-@njit(inline="always", error_model="numpy")
-def _blocked_at(where, hard, loss, s):
-    """Return the mean sample where a beam is blocked, with a further loss at sample ``s``."""
     if hard < np.float32(_DARK) and loss > np.float32(0.0):
-        return np.float32((where * hard + loss * s) / (hard + loss))
-    return where
+        where = np.float32((where * hard + loss * s) / (hard + loss))
+    return hard + loss, where
 
 
 @njit(inline="always", error_model="numpy")

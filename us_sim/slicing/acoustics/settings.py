@@ -58,11 +58,7 @@ _FREQUENCY = Quantity("frequency", 0.5e6, 50e6)
 
 @dataclass(frozen=True)
 class TissueAcoustics(Settings):
-    """The acoustic constants of the tissue with one label.
-
-    Raises:
-        ProbeError: a constant is out of its range.
-    """
+    """The acoustic constants of the tissue with one label."""
 
     section = "imaging.acoustics.tissues"
     error = ProbeError
@@ -131,11 +127,7 @@ class TissueAcoustics(Settings):
 
 @dataclass(frozen=True)
 class SoundSettings(Settings):
-    """Artefacts of sound that are made along the current beams; a part that is off costs nothing.
-
-    Raises:
-        ProbeError: a value is out of range, with its name and the range.
-    """
+    """Artefacts of sound made along the current beams; a part that is off costs nothing."""
 
     section = "imaging.acoustics"
     error = ProbeError

@@ -105,17 +105,10 @@ def draw_surfaces(  # noqa: PLR0913
             normal, crossings.element[f], rest_index, tetrahedra, corners, nodes, rigid, gradient
         ):
             continue
-        length = np.sqrt(gradient[0] ** 2 + gradient[1] ** 2 + gradient[2] ** 2)
-        nx = (
-            gradient[0] * beam_axes[0, 0]
-            + gradient[1] * beam_axes[0, 1]
-            + gradient[2] * beam_axes[0, 2]
-        ) / length
-        nz = (
-            gradient[0] * beam_axes[1, 0]
-            + gradient[1] * beam_axes[1, 1]
-            + gradient[2] * beam_axes[1, 2]
-        ) / length
+        gx, gy, gz = gradient[0], gradient[1], gradient[2]
+        length = np.sqrt(gx**2 + gy**2 + gz**2)
+        nx = (gx * beam_axes[0, 0] + gy * beam_axes[0, 1] + gz * beam_axes[0, 2]) / length
+        nz = (gx * beam_axes[1, 0] + gy * beam_axes[1, 1] + gz * beam_axes[1, 2]) / length
         dx, dz = directions[k, 0], directions[k, 1]
         cosine = nx * dx + nz * dz
         size = abs(cosine)
@@ -247,6 +240,8 @@ DISTANCE = 40.0  # parts of a voxel in which the distance of a surface is kept
 _REACH = 3  # voxels
 _SIGMA = 1.5  # voxels
 _PARTS = 256  # of the weighted mean that are told apart
+_WEIGHTS = np.exp(-0.5 * (np.arange(-_REACH, _REACH + 1) / _SIGMA) ** 2)
+_WEIGHTS /= _WEIGHTS.sum()
 
 
 class SurfaceNormals:
@@ -256,39 +251,21 @@ class SurfaceNormals:
         self._labels = labels  # whose memory is no other volume's as long as these are kept
         shape = np.array(labels.shape, dtype=np.int64)
         self.blocks = np.full(tuple(-(-shape // BLOCK)), -1, dtype=np.int32)
-        offset = np.arange(-_REACH, _REACH + 1)
-        weights = np.exp(-0.5 * (offset / _SIGMA) ** 2)
-        weights = (weights / weights.sum()).astype(np.float32)
+        weights = _WEIGHTS.astype(np.float32)
         flat = labels.reshape(-1)
         count = _mark_blocks(flat, shape, self.blocks)
         self.normals = np.zeros((count, BLOCK**3, 4), dtype=np.int8)
         _fill_normals(flat, shape, weights, _DISTANCES, self.blocks, self.normals)
-
-    def get_normal(self, i: int, j: int, k: int) -> tuple[NDArray[np.float64], float]:
-        """Return the unit normal (3,) into the voxel's own label, and the voxels to the surface.
-
-        Zeros where there is no surface.
-        """
-        block = self.blocks[i // BLOCK, j // BLOCK, k // BLOCK]
-        if block < 0:
-            return np.zeros(3), 0.0
-        within = ((i % BLOCK) * BLOCK + j % BLOCK) * BLOCK + k % BLOCK
-        found = self.normals[block, within]
-        return np.asarray(found[:3] / 127.0), float(found[3] / DISTANCE)
 
 
 def _distances() -> NDArray[np.int8]:
     """Return (`_PARTS`,) distances of a plane, `DISTANCE`-ths of a voxel, by the part this side."""
     part = (np.arange(_PARTS) + 0.5) / _PARTS
     # A Gaussian that ends at the reach, of voxels: as the mean of a half space's would be.
-    offset = np.arange(-_REACH, _REACH + 1)
-    weights = np.exp(-0.5 * (offset / _SIGMA) ** 2)
-    total = np.concatenate([[0.0], np.cumsum(weights / weights.sum())])
-    return (
-        np.asarray(np.rint(DISTANCE * np.interp(part, total, np.append(offset, _REACH + 1) - 0.5)))
-        .clip(-127, 127)
-        .astype(np.int8)
-    )
+    total = np.concatenate([[0.0], np.cumsum(_WEIGHTS)])
+    place = np.arange(-_REACH, _REACH + 2) - 0.5
+    distance = np.rint(DISTANCE * np.interp(part, total, place))
+    return np.clip(distance, -127, 127).astype(np.int8)
 
 
 _DISTANCES = _distances()

@@ -20,12 +20,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.geometry.mesh_faces import FACES
 from us_sim.kernels import njit
 from us_sim.slicing.cutting.section import ON_PLANE, compute_adjugate, is_solid
 from us_sim.slicing.probe.plane import SlicePlane
-
-FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
-"""Corners of the four faces of a tetrahedron; face f is opposite to corner f."""
 
 _STEEP = 1e3
 """Voxels per pixel beyond which a map is so steep that rounding may lead it out of the volume."""

@@ -174,9 +174,7 @@ def sample_labels(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDA
         elements[~plane.make_shown_mask()] = BLACK
     image = np.empty(elements.shape, dtype=np.uint8)
     run_rows_in_parallel(
-        threads,
-        plane.rows,
-        lambda a, b: sample_nearest(voxels, shape, maps, elements, a, b, image),
+        threads, plane.rows, lambda a, b: sample_nearest(voxels, shape, maps, elements, a, b, image)
     )
     return image
 

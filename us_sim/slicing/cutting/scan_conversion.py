@@ -45,12 +45,7 @@ from us_sim.slicing.cutting.resampling import (
 )
 from us_sim.slicing.cutting.section import TetrahedronClusters, require_finite_nodes
 from us_sim.slicing.cutting.slicer import Slicer
-from us_sim.slicing.cutting.span_sampling import (
-    INNER_MARGIN,
-    fill_element_subset,
-    fill_elements,
-    sample_spans,
-)
+from us_sim.slicing.cutting.span_sampling import INNER_MARGIN, fill_elements, sample_spans
 from us_sim.slicing.probe.plane import SlicePlane
 
 
@@ -97,10 +92,7 @@ class ScanConversion(Slicer):
 
     def locate_pixels(self, nodes: ArrayLike, plane: SlicePlane) -> LocatedPixels:
         """Find the tetrahedron and the rest place of each pixel, by spans of pixels."""
-        count, outline, runs, spans = self._spans_of(nodes, plane)
-        elements = np.empty((plane.rows, plane.columns), dtype=np.int32)
-        fill_elements(spans, self._used, runs, count, BLACK, *outline, elements)
-        return self._located(elements, count)
+        return self.locate_pixel_subset(nodes, plane, (1, 1))
 
     def locate_pixel_subset(
         self, nodes: ArrayLike, plane: SlicePlane, steps: tuple[int, int]
@@ -109,13 +101,10 @@ class ScanConversion(Slicer):
         count, outline, runs, spans = self._spans_of(nodes, plane)
         shape = -(-plane.rows // steps[0]), -(-plane.columns // steps[1])
         elements = np.empty(shape, dtype=np.int32)
-        fill_element_subset(
+        fill_elements(
             spans, self._used, runs, count, BLACK, *outline, np.array(steps), plane.columns,
             elements,
         )  # fmt: skip
-        return self._located(elements, count)
-
-    def _located(self, elements: NDArray[np.int32], count: int) -> LocatedPixels:
         tetrahedra = self._clusters.order[self._cuts.tetrahedra[:count]]
         return LocatedPixels(elements, self._cuts.maps[: count + 1].copy(), tetrahedra)
 

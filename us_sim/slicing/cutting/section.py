@@ -165,17 +165,8 @@ class TetrahedronClusters:
         Raises:
             MeshError: nodes that are not finite.
         """
-        count = _near(
-            nodes,
-            plane.to_pixel,
-            plane.columns,
-            plane.rows,
-            self.tetrahedra,
-            self._starts,
-            self._members,
-            self._sides,
-            self._near,
-        )
+        clusters = self.tetrahedra, self._starts, self._members, self._sides, self._near
+        count = _near(nodes, plane.to_pixel, plane.columns, plane.rows, *clusters)
         if count < 0:
             require_finite_nodes(nodes, None)
             raise MeshError("nodes are so far away that no slice can be cut: check their unit")

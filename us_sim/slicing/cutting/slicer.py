@@ -40,12 +40,7 @@ class Slicer(ABC):
     skipped: int = 0  # inverted or flat tetrahedra on the latest image, which were left out
 
     def __init__(
-        self,
-        volume: Volume,
-        rest_nodes: ArrayLike,
-        tetrahedra: ArrayLike,
-        *,
-        threads: int = 1,
+        self, volume: Volume, rest_nodes: ArrayLike, tetrahedra: ArrayLike, *, threads: int = 1
     ) -> None:
         """Take ``rest_nodes`` (N, 3) m in the undeformed volume; ``tetrahedra`` (M, 4) index them.
 
@@ -74,9 +69,6 @@ class Slicer(ABC):
 
         Right after an image of these same two objects the mesh is not cut again, so nodes must not
         be written to in between.
-
-        Raises:
-            MeshError: as for `cut_image`.
         """
 
     def locate_pixel_subset(
@@ -90,7 +82,6 @@ class Slicer(ABC):
 
         Raises:
             VolumeError: the volume has no labels.
-            MeshError: as for `cut_image`.
         """
         get_label_voxels(self._volume)  # refuses before the work
         return self.sample_located_labels(self._locate_anew(nodes, plane))
@@ -119,9 +110,6 @@ class Slicer(ABC):
         """Compute the rest place of each pixel's tissue: (rows, columns, 3) m, frame ``patient``.
 
         Outside the mesh that is the pixel itself; NaN where tissue moved away, and outside spans.
-
-        Raises:
-            MeshError: as for `cut_image`.
         """
         to_patient = self._volume.index_to_patient
         index = self._locate_anew(nodes, plane).compute_rest_index()
@@ -129,12 +117,7 @@ class Slicer(ABC):
 
 
 def create_slicer(
-    name: str,
-    volume: Volume,
-    rest_nodes: ArrayLike,
-    tetrahedra: ArrayLike,
-    *,
-    threads: int = 1,
+    name: str, volume: Volume, rest_nodes: ArrayLike, tetrahedra: ArrayLike, *, threads: int = 1
 ) -> Slicer:
     """Create the slicer of that name among `SLICERS`; further arguments as for `Slicer`.
 

@@ -108,39 +108,14 @@ def _blacken_nowhere(x, line):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_elements(  # noqa: PLR0913
-    spans, used, runs, rigid, black, outlines, points, turns, outline_number, elements
-):
-    """Fill ``elements`` (rows, columns) int32 with the number of each pixel's map.
+    spans, used, runs, rigid, black, outlines, points, turns, outline_number, steps, columns,
+    elements,
+):  # fmt: skip
+    """Fill ``elements`` int32 with the numbers of the maps of every n-th row and column.
 
     Shapes and units:
         rigid: the number of the map outside the mesh. black: the number for no map.
         spans … outline_number: as for `sample_spans`.
-    """
-    rows, columns = elements.shape
-    winding = np.empty(columns + 1, dtype=np.int32)
-    covered = np.empty(columns, dtype=np.bool_)
-    for row in range(rows):
-        elements[row] = black
-        for k in range(2):
-            elements[row, runs[row, k, 0] : runs[row, k, 1]] = rigid
-        for k in range(used[row]):
-            span = spans[row, k]
-            elements[row, span & _COLUMN : span >> END_SHIFT & _COLUMN] = span >> CUT_SHIFT
-        if (elements[row] == rigid).any():
-            mark_covered(outlines, points, turns, outline_number, row, winding, covered)
-            for i in range(columns):
-                if elements[row, i] == rigid and covered[i]:
-                    elements[row, i] = black
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def fill_element_subset(  # noqa: PLR0913
-    spans, used, runs, rigid, black, outlines, points, turns, outline_number, steps, columns,
-    elements,
-):  # fmt: skip
-    """Fill elements as `fill_elements` does, of every n-th row and column of an image.
-
-    Shapes and units:
         steps: (2,) rows and columns of the image from one element to the next.
     """
     rows, places = elements.shape

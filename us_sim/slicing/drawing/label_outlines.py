@@ -26,11 +26,7 @@ _LEAST = 6.0  # pixels that an outline must enclose
 
 
 def trace_label_outlines(
-    labels: NDArray[np.uint8],
-    label: int,
-    *,
-    smoothing: float = 1.0,
-    refine: Refine | None = None,
+    labels: NDArray[np.uint8], label: int, *, smoothing: float = 1.0, refine: Refine | None = None
 ) -> list[NDArray[np.float64]]:
     """Trace closed outlines of the areas and holes of one label, the longest first.
 

@@ -121,10 +121,6 @@ class ColourScale:
         np.nan_to_num(levels, copy=False)
         return np.asarray(np.rint(np.clip(levels, 0.0, 255.0, out=levels), out=levels), np.uint8)
 
-    def format_value(self, value: float) -> str:
-        """Format a value as the bar shows it, without the unit."""
-        return f"{self.factor * value:.3g}"
-
 
 @dataclass(frozen=True, eq=False)
 class Overlay:
@@ -181,7 +177,7 @@ class ColourBar:
         margin, width, height = text, text, _HEIGHT * text
         title = render_text(f"{scale.title} {scale.unit}".strip(), text, _TEXT)
         values = [
-            render_text(scale.format_value(value), text, _TEXT)
+            render_text(f"{scale.factor * value:.3g}", text, _TEXT)
             for value in (scale.high, 0.5 * (scale.low + scale.high), scale.low)
         ]
         top = margin + title.height + text // 2

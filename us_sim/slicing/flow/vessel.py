@@ -145,11 +145,7 @@ class LumenMap:
 
 
 def load_lumen_map(volume: Volume, label: int) -> tuple[Lumen, LumenMap]:
-    """Load or measure the lumen of a label, and the map of the voxels around it.
-
-    Raises:
-        VolumeError: as `measure_lumen`.
-    """
+    """Load or measure the lumen of a label, and the map of the voxels around it."""
     assert volume.labels is not None
     inside = volume.labels == label
     about = hashlib.sha256(np.packbits(inside))
@@ -224,16 +220,6 @@ class Vessel:
         self.apply_settings(settings)
 
     @property
-    def settings(self) -> FlowSettings:
-        """The settings of its flow."""
-        return self._settings
-
-    @property
-    def flow(self) -> float:
-        """m³/s along the vessel at the time of the latest `advance_to`, averaged over the pulse."""
-        return self._flow
-
-    @property
     def areas(self) -> NDArray[np.float64]:
         """(S,) m², of the lumen across the vessel, at its stations in the direction of the flow."""
         return self._now.areas
@@ -257,18 +243,15 @@ class Vessel:
         return 1.0 if cosine > 0.0 else -1.0
 
     def apply_settings(self, settings: FlowSettings) -> None:
-        """Apply other settings from now on; blood that has filled up stays.
-
-        Raises:
-            SceneError: as `find_flow_sign`.
-        """
+        """Apply other settings from now on; blood that has filled up stays."""
         sign = self.find_flow_sign(settings)
-        self._settings = settings
+        self.settings = settings
         self._sign = sign
         self._waveform = Waveform(settings)
         lumen = self._plain
         self._circulation = Circulation(settings, lumen.areas, lumen.spacing, self._circulation)
-        self._flow = self._circulation.at_rest
+        #: m³/s along the vessel at the time of the latest `advance_to`, averaged over the pulse.
+        self.flow = self._circulation.at_rest
         self._find_axis_velocity()
 
     def attach_mesh(self, mesh: TetrahedralMesh | None) -> None:
@@ -284,7 +267,7 @@ class Vessel:
         if nodes is not None and self._mesh is not None:
             self._now = self._carried.deform_lumen(nodes)
         assert self._circulation is not None
-        self._flow = self._circulation.compute_flow(time, self._now.areas)
+        self.flow = self._circulation.compute_flow(time, self._now.areas)
         self._find_axis_velocity()
 
     def evaluate_pulse(self, time: ArrayLike) -> NDArray[np.float64]:
@@ -294,7 +277,7 @@ class Vessel:
     def _find_axis_velocity(self) -> None:
         """Find the velocity (S, 3) m/s on the axis that makes the flow the same at all stations."""
         filled = np.maximum(self._now.filled, 1e-12)
-        speed = np.where(self._now.filled > 1e-12, self._sign * self._flow / filled, 0.0)
+        speed = np.where(self._now.filled > 1e-12, self._sign * self.flow / filled, 0.0)
         #: (S, 3) m/s, on the axis at each station, averaged over the pulse.
         self.axis_velocity = speed[:, None] * self._now.tangents
 
@@ -353,15 +336,10 @@ class Circulation:
         self._source = settings.bed_pressure if self._reservoir else self._rest_pressure
         self._bed = (self._source - self._rest_pressure) / self.at_rest
         self._filling_time = settings.filling_time
-        self._pressure = self._rest_pressure
+        self.pressure = self._rest_pressure  # Pa, in the reservoir before the vessel
         self._time: float | None = None
         if before is not None and before._reservoir and self._reservoir:
-            self._pressure, self._time = min(before._pressure, self._source), before._time
-
-    @property
-    def pressure(self) -> float:
-        """Pa, in the reservoir before the vessel."""
-        return self._pressure
+            self.pressure, self._time = min(before.pressure, self._source), before._time
 
     def compute_flow(self, time: float, areas: NDArray[np.float64]) -> float:
         """Return m³/s averaged over the pulse, at a time (s), with areas (S,) m² since the last.
@@ -374,15 +352,15 @@ class Circulation:
             vessel = float((self._resistances / open_**2).sum())
             conductance = 1.0 / (self._downstream + vessel)
         if self._time is None or time < self._time:
-            self._pressure = self._rest_pressure
+            self.pressure = self._rest_pressure
         elif self._reservoir:
             # The equation is linear: between two frames its solution is exact.
             rate = 1.0 + self._bed * conductance
             settled = self._source / rate
             left = math.exp(-rate * (time - self._time) / self._filling_time)
-            self._pressure = settled + (self._pressure - settled) * left
+            self.pressure = settled + (self.pressure - settled) * left
         self._time = time
-        return conductance * self._pressure
+        return conductance * self.pressure
 
 
 _BELLS = ((0.13, 0.045, 1.0), (0.33, 0.06, -0.32), (0.52, 0.09, 0.10))

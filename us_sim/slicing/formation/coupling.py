@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import MeshError
+from us_sim.geometry.collider_distance import rotate_vector_back
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 from us_sim.slicing.probe.probe import Probe
@@ -165,7 +166,7 @@ def _find_entries(nodes, rest, triangles, rotation, position, starts, directions
     moved = np.zeros(lines)
     gap[:] = np.inf
     press[:] = 0.0
-    point = np.empty((3, 6))  # of a triangle's corners: x, y, z of now in frame probe, and moved
+    point = np.empty((3, 5))  # of a triangle's corners: x, y, z of now in frame probe, and moved
     ends = np.empty((2, 4))  # of a cut: x, z, and the displacement along them
     for t in range(len(triangles)):
         above = 0
@@ -174,24 +175,16 @@ def _find_entries(nodes, rest, triangles, rotation, position, starts, directions
             dx = nodes[n, 0] - position[0]
             dy = nodes[n, 1] - position[1]
             dz = nodes[n, 2] - position[2]
-            y = rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz
-            point[c, 0] = dx
-            point[c, 1] = y
-            point[c, 2] = dy
-            point[c, 3] = dz
-            above += y >= 0.0
+            point[c, 0], point[c, 1], point[c, 2] = rotate_vector_back(rotation, dx, dy, dz)
+            above += point[c, 1] >= 0.0
         if above == 0 or above == 3:
             continue
         for c in range(3):
             n = triangles[t, c]
-            dx, dy, dz = point[c, 0], point[c, 2], point[c, 3]
-            point[c, 0] = rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz
-            point[c, 2] = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
             dx = nodes[n, 0] - rest[n, 0]
             dy = nodes[n, 1] - rest[n, 1]
             dz = nodes[n, 2] - rest[n, 2]
-            point[c, 3] = rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz
-            point[c, 4] = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
+            point[c, 3], _, point[c, 4] = rotate_vector_back(rotation, dx, dy, dz)
         found = 0
         for c in range(3):
             d = (c + 1) % 3
@@ -202,16 +195,12 @@ def _find_entries(nodes, rest, triangles, rotation, position, starts, directions
                     ends[found, q] = point[c, axis] + fraction * (point[d, axis] - point[c, axis])
                 found += 1
         # The normal's x and z, of any length.
-        ux, uy, uz = (
-            point[1, 0] - point[0, 0],
-            point[1, 1] - point[0, 1],
-            point[1, 2] - point[0, 2],
-        )
-        vx, vy, vz = (
-            point[2, 0] - point[0, 0],
-            point[2, 1] - point[0, 1],
-            point[2, 2] - point[0, 2],
-        )
+        ux = point[1, 0] - point[0, 0]
+        uy = point[1, 1] - point[0, 1]
+        uz = point[1, 2] - point[0, 2]
+        vx = point[2, 0] - point[0, 0]
+        vy = point[2, 1] - point[0, 1]
+        vz = point[2, 2] - point[0, 2]
         normal_x = uy * vz - uz * vy
         normal_z = ux * vy - uy * vx
         _meet_lines(ends, normal_x, normal_z, starts, directions, depth, entered, moved, gap, press)

@@ -297,9 +297,6 @@ class LinearProbe(Probe):
     The image lies in y = 0. The centre of column ``i`` is at
     ``x = (i + 0.5) aperture / columns - aperture / 2`` and that of row ``j`` at
     ``z = (j + 0.5) depth / rows``, so the upper edge of row 0 is the transducer's face.
-
-    Raises:
-        ProbeError: a value is out of its range.
     """
 
     aperture: float = setting(Quantity("length", 3e-3, 0.2), "of the face along the array")
@@ -354,9 +351,6 @@ class ConvexProbe(Probe):
 
     The middle of the arc is the origin of frame ``probe``, its centre at z = -radius, and its ends
     lie at z < 0. So the image begins behind the origin, at the ends of the arc.
-
-    Raises:
-        ProbeError: a value is out of its range.
     """
 
     radius: float = setting(Quantity("length", 3e-3, 0.3), "of the face's curvature")
