@@ -89,11 +89,7 @@ class BMode:
     def prepare_settings(
         self, probe: Probe, imaging: Imaging, acoustics: Acoustics | None = None
     ) -> None:
-        """Load everything for images with these settings, so that the first is not late.
-
-        Raises:
-            ProbeError: volume, probe and settings do not go together.
-        """
+        """Load everything for images with these settings, so that the first is not late."""
         warm_up(self._method, self._threads)
         live = self._acoustics_of(probe, acoustics)
         if live is not None and acoustics is not None:

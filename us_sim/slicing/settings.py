@@ -131,7 +131,10 @@ _LENGTH = Quantity("length", 0.2e-3, 0.05)
 
 @dataclass(frozen=True)
 class StrainSettings(Settings):
-    """Strain images: the tissue's own, and a scanner's estimate from two images."""
+    """Strain images: the tissue's own, and an estimate made from two images as a scanner makes it.
+
+    The estimate finds windows of one image again in the other, along the beams.
+    """
 
     section = "strain"
     error = ProbeError

@@ -97,20 +97,18 @@ def trace_beams(  # noqa: PLR0913
     of_label = media.of_label
     sides = (shape[0], shape[1], shape[2])
     for k in range(beams):
-        soft = nothing
-        hard = nothing
-        where = nothing
-        was = np.uint8(NOTHING)
+        soft_loss = block_loss = block_sample = nothing
+        previous = np.uint8(NOTHING)
         x = y = z = np.int64(0)
         gx = gy = gz = np.int64(0)
         line = (lines[k, 0], lines[k, 1], lines[k, 2], lines[k, 3])
-        held = np.int32(-2)  # the element whose gradient is gx, gy, gz
+        last_element = np.int32(-2)  # the element whose gradient is gx, gy, gz
         for s in range(samples):
             element = elements[np.uint64(places[k, s])]
             medium = np.uint8(NOTHING)
             px, py, pz = x, y, z
             if element >= 0:
-                if element == held:
+                if element == last_element:
                     x += gx
                     y += gy
                     z += gz
@@ -122,21 +120,24 @@ def trace_beams(  # noqa: PLR0913
                     gz = _fixed(m[2, 1] * line[2] + m[2, 2] * line[3])
                 medium = _medium_in(x, y, z, voxels, sides, of_label)
             is_far = max(max(abs(x - px), abs(y - py)), abs(z - pz)) >= _LEAP
-            if medium == was and not is_far:
+            if medium == previous and not is_far:
                 length = np.float32(0.5) if s == 0 else np.float32(1.0)
-                soft += length * media.loss[medium]
+                soft_loss += length * media.loss[medium]
                 if media.blocks[medium]:
-                    hard, where = _block(length * media.shadow[medium], s, hard, where)
+                    block_loss, block_sample = _block(
+                        length * media.shadow[medium], s, block_loss, block_sample
+                    )
             else:
                 # Another tetrahedron is squeezed otherwise, which matters where a border may be.
-                changes = element != held and element >= 0 and held >= 0 and was != NOTHING
-                soft, hard, where, was, found = _follow_step(
-                    k, s, _LEGS if changes else 1, (px, py, pz), (x, y, z), element, was, medium,
-                    soft, hard, where, line, elements, wide, steps, maps, voxels, sides, media,
-                    time_gain[s], crossings, found,
+                is_within = previous != NOTHING and min(element, last_element) >= 0
+                legs = _LEGS if is_within and element != last_element else 1
+                soft_loss, block_loss, block_sample, previous, found = _follow_step(
+                    k, s, legs, (px, py, pz), (x, y, z), element, previous, medium, soft_loss,
+                    block_loss, block_sample, line, elements, wide, steps, maps, voxels, sides,
+                    media, time_gain[s], crossings, found,
                 )  # fmt: skip
-            held = element
-            level = time_gain[s] - soft + media.scattering[medium]
+            last_element = element
+            level = time_gain[s] - soft_loss + media.scattering[medium]
             direction = media.fibres[medium]
             if direction >= 0:
                 sine = (
@@ -146,17 +147,17 @@ def trace_beams(  # noqa: PLR0913
                 square = sine * sine
                 level -= media.anisotropy[medium] * square / (square + media.half_sine[medium])
             gain[s, k] = level
-            blocked[s, k] = hard
-            if hard > nothing:
-                blocker[s, k] = where
+            blocked[s, k] = block_loss
+            if block_loss > nothing:
+                blocker[s, k] = block_sample
                 first_blocked = min(first_blocked, s)
     return found, first_blocked
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _follow_step(  # noqa: PLR0913
-    k, s, legs, before, behind, element, was, last_medium, soft, hard, where, line, elements, wide,
-    steps, maps, voxels, sides, media, time_gain, crossings, found,
+    k, s, legs, before, behind, element, previous, end_medium, soft_loss, block_loss, block_sample,
+    line, elements, wide, steps, maps, voxels, sides, media, time_gain, crossings, found,
 ):  # fmt: skip
     """Follow beam ``k`` from sample ``s - 1`` to ``s``, where it may meet borders.
 
@@ -165,80 +166,83 @@ def _follow_step(  # noqa: PLR0913
         before, behind: the two samples, fixed-point voxel coordinates.
 
     Returns:
-        soft and hard loss, the mean sample of the latter, the last medium, number of crossings.
+        soft loss, loss to blockers and its mean sample (dB), last medium, number of crossings.
     """
     of_label = media.of_label
     px, py, pz = before
     for leg in range(1, legs + 1):
         ex, ey, ez = behind
-        inner, next_medium = element, last_medium
+        leg_element, next_medium = element, end_medium
         if leg < legs:
             at = s - 1 + leg / legs
-            inner = _find_element(elements, wide, steps, line, at, element)
-            ex, ey, ez = _locate_voxel(maps[np.uint64(inner)], line, at)
+            leg_element = _find_element(elements, wide, steps, line, at, element)
+            ex, ey, ez = _locate_voxel(maps[np.uint64(leg_element)], line, at)
             next_medium = _medium_in(ex, ey, ez, voxels, sides, of_label)
         # Where tissue is squeezed there is more of it between two samples.
         parts = np.int64(1)
-        if element >= 0 and was != NOTHING:
+        if element >= 0 and previous != NOTHING:
             apart = max(max(abs(ex - px), abs(ey - py)), abs(ez - pz)) >> _BITS
             parts = np.int64(min(int(1 + apart // _CLOSE), _MOST_PARTS))
         length = np.float32(0.5) if s == 0 else np.float32(1.0 / (legs * parts))
         begin = np.float32(s - 1 + (leg - 1) / legs)
         lx, ly, lz = px, py, pz
         for q in range(1, parts + 1):
-            nx, ny, nz, now = ex, ey, ez, next_medium
+            nx, ny, nz, current = ex, ey, ez, next_medium
             if q < parts:
                 nx = px + (ex - px) * q // parts
                 ny = py + (ey - py) * q // parts
                 nz = pz + (ez - pz) * q // parts
-                now = _medium_in(nx, ny, nz, voxels, sides, of_label)
+                current = _medium_in(nx, ny, nz, voxels, sides, of_label)
             t = length
-            if now != was:
+            if current != previous:
                 high, bx, by, bz = _find_border(
-                    lx, ly, lz, nx, ny, nz, s, was, now, voxels, sides, of_label
+                    lx, ly, lz, nx, ny, nz, s, previous, current, voxels, sides, of_label
                 )
                 t = np.float32(high) * length
-            soft += t * media.loss[was]
-            if media.blocks[was]:
-                hard, where = _block(t * media.shadow[was], s, hard, where)
-            if now != was:
-                if was != NOTHING and now != NOTHING and found < len(crossings.beam):
+            soft_loss += t * media.loss[previous]
+            if media.blocks[previous]:
+                block_loss, block_sample = _block(
+                    t * media.shadow[previous], s, block_loss, block_sample
+                )
+            if current != previous:
+                if previous != NOTHING and current != NOTHING and found < len(crossings.beam):
                     crossings.beam[found] = k
                     crossings.distance[found] = begin + (q - 1) * length + t
-                    crossings.media[found, 0] = was
-                    crossings.media[found, 1] = now
-                    crossings.element[found] = inner
+                    crossings.media[found, 0] = previous
+                    crossings.media[found, 1] = current
+                    crossings.element[found] = leg_element
                     crossings.voxel[found, 0] = bx * _UNIT - _HALF
                     crossings.voxel[found, 1] = by * _UNIT - _HALF
                     crossings.voxel[found, 2] = bz * _UNIT - _HALF
                     crossings.slope[found, 0] = (ex - px) * legs * _UNIT
                     crossings.slope[found, 1] = (ey - py) * legs * _UNIT
                     crossings.slope[found, 2] = (ez - pz) * legs * _UNIT
-                    crossings.level[found] = time_gain - soft - hard
+                    crossings.level[found] = time_gain - soft_loss - block_loss
                     found += 1
-                soft, hard, where = _pass_border(
-                    media.crossing[was, now], length - t, s, media.blocks[was],
-                    media.blocks[now], media.loss[now], media.shadow[now], soft, hard, where,
+                soft_loss, block_loss, block_sample = _pass_border(
+                    media.crossing[previous, current], length - t, s, media.blocks[previous],
+                    media.blocks[current], media.loss[current], media.shadow[current],
+                    soft_loss, block_loss, block_sample,
                 )  # fmt: skip
-                was = now
+                previous = current
             lx, ly, lz = nx, ny, nz
         px, py, pz = ex, ey, ez
-    return soft, hard, where, was, found
+    return soft_loss, block_loss, block_sample, previous, found
 
 
 @njit(inline="always", error_model="numpy")
 def _pass_border(  # noqa: PLR0913
-    border, rest, s, was_blocker, is_blocker, loss, shadow, soft, hard, where
+    border, rest, s, was_blocker, is_blocker, loss, shadow, soft_loss, block_loss, block_sample
 ):
     """Add what a border takes (dB), and the way behind it, ``rest`` samples."""
     if was_blocker or is_blocker:
-        hard, where = _block(border, s, hard, where)
+        block_loss, block_sample = _block(border, s, block_loss, block_sample)
     else:
-        soft += border
-    soft += rest * loss
+        soft_loss += border
+    soft_loss += rest * loss
     if is_blocker:
-        hard, where = _block(rest * shadow, s, hard, where)
-    return soft, hard, where
+        block_loss, block_sample = _block(rest * shadow, s, block_loss, block_sample)
+    return soft_loss, block_loss, block_sample
 
 
 @njit(inline="always", error_model="numpy")
@@ -264,16 +268,16 @@ def _find_element(elements, wide, steps, line, at, instead):
 
 
 @njit(inline="always", error_model="numpy")
-def _find_border(ax, ay, az, bx, by, bz, s, was, now, voxels, sides, of_label):  # noqa: PLR0913
+def _find_border(ax, ay, az, bx, by, bz, s, previous, current, voxels, sides, of_label):  # noqa: PLR0913
     """Halve the way between two media; return the part before the border, and a place behind it."""
-    if s == 0 or was == NOTHING or now == NOTHING:
+    if s == 0 or previous == NOTHING or current == NOTHING:
         return 0.0 if s == 0 else 0.5, bx, by, bz
     high = 1.0
     part = 1.0
     for _ in range(_HALVINGS):
         part *= 0.5
         cx, cy, cz = (ax + bx) >> 1, (ay + by) >> 1, (az + bz) >> 1
-        if _medium_in(cx, cy, cz, voxels, sides, of_label) == was:
+        if _medium_in(cx, cy, cz, voxels, sides, of_label) == previous:
             ax, ay, az = cx, cy, cz
         else:
             bx, by, bz = cx, cy, cz
@@ -282,11 +286,11 @@ def _find_border(ax, ay, az, bx, by, bz, s, was, now, voxels, sides, of_label): 
 
 
 @njit(inline="always", error_model="numpy")
-def _block(loss, s, hard, where):
-    """Add a loss at sample ``s`` to the hard loss and to the mean sample of that."""
-    if hard < np.float32(_DARK) and loss > np.float32(0.0):
-        where = np.float32((where * hard + loss * s) / (hard + loss))
-    return hard + loss, where
+def _block(loss, s, block_loss, block_sample):
+    """Add a loss at sample ``s`` to that of blockers, and to the mean sample of that."""
+    if block_loss < np.float32(_DARK) and loss > np.float32(0.0):
+        block_sample = np.float32((block_sample * block_loss + loss * s) / (block_loss + loss))
+    return block_loss + loss, block_sample
 
 
 @njit(inline="always", error_model="numpy")
@@ -521,7 +525,7 @@ def _is_blocked(k, part, dark, elements, wide, steps, maps, voxels, shape, lines
     ends = (sides[0] + END, sides[1] + END, sides[2] + END)
     rows = len(elements) // wide
     lost = 0.0
-    was = np.uint8(NOTHING)
+    previous = np.uint8(NOTHING)
     for s in range(samples * _FINER):
         at = (s + 0.5) / _FINER - 0.5
         column = first[0] + at * first[2]
@@ -540,9 +544,9 @@ def _is_blocked(k, part, dark, elements, wide, steps, maps, voxels, shape, lines
             )  # fmt: skip
         if media.blocks[medium]:
             lost += media.shadow[medium] / _FINER
-        if medium != was and (media.blocks[medium] or media.blocks[was]):
-            lost += media.crossing[was, medium]
-        was = medium
+        if medium != previous and (media.blocks[medium] or media.blocks[previous]):
+            lost += media.crossing[previous, medium]
+        previous = medium
         if lost > _HALF_AMPLITUDE:
             return True
     return False

@@ -78,7 +78,7 @@ _FLAT = 1e-3  # slope, a pixel, at which nothing is known of where the border li
 
 
 class _Share(NamedTuple):
-    """How much of the surroundings of each voxel around a label has it."""
+    """The part of the surroundings of each voxel, in a box around a label, that has it."""
 
     field: NDArray[np.float32]  # (i, j, k), 0 to 1
     start: NDArray[np.int64]  # (3,) the volume's voxel that the first one is

@@ -165,7 +165,7 @@ _ACROSS = 0.12  # cosine between beam and flow: 83 degrees
 
 
 class FlowAbsence(Enum):
-    """Why no flow is seen in a part of the image; nothing where it should be seen."""
+    """Reasons why no flow is seen in a part of the image; NOTHING where it should be seen."""
 
     NOTHING = ""
     NO_CONTACT = "no_contact"  # the beams there have no contact, or too little
