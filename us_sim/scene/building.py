@@ -1,4 +1,4 @@
-"""The objects a scene names, each made (and its module imported) only when it is asked for.
+"""Building the objects that a scene names; each function imports only what its object needs.
 
 >>> from us_sim.scene.building import structure_colour, build_probe, build_tracking
 >>> from us_sim.scene.reading import load_scene
@@ -54,11 +54,7 @@ _TAKEN_BACK = "; of what the base of a scene says, `null` takes back a material 
 
 
 def load_volume(scene: Scene, progress: Callable[[float, str], None] | None = None) -> Volume:
-    """The scene's volume in frame ``patient``.
-
-    Raises:
-        VolumeError, CaseError: its file or its case cannot be read.
-    """
+    """Load the scene's volume in frame ``patient``, from its case, its file or its phantom."""
     if scene.volume.case:
         from us_sim.volume.cases.case import read_case
 
@@ -81,12 +77,12 @@ def load_volume(scene: Scene, progress: Callable[[float, str], None] | None = No
 
 
 def load_path(scene: Scene, file: Path, topic: str | None = None) -> ProbePath:
-    """The probe path in a bag or a recording, of the scene's tracker or of the probe itself.
+    """Load the path of the scene's tracker, or of the probe itself, from a bag or a recording.
 
     Args:
-        scene: whose tracker says which body of the file it is, where the file has that.
+        scene: its tracker names the body, unless the file lacks that one.
         file: bag or recording.
-        topic: the body that a person names.
+        topic: of the body, as a person names it.
 
     Raises:
         BagError: it cannot be read, or is neither in the tracker's frame nor in ``patient``.
@@ -116,11 +112,7 @@ def load_path(scene: Scene, file: Path, topic: str | None = None) -> ProbePath:
 
 
 def build_probe(scene: Scene) -> Probe:
-    """The transducer that images.
-
-    Raises:
-        SceneError: its image is too large.
-    """
+    """Build the transducer that images, with the number of pixels that the scene asks for."""
     section = scene.probe
     array: Probe = section.array.resolve_settings(PROBES)
     image = section.image or ((512, 512) if section.geometry == "linear" else 512)
@@ -133,11 +125,7 @@ def build_probe(scene: Scene) -> Probe:
 
 
 def build_scanner(scene: Scene, volume: Volume, *, threads: int = 1) -> BMode:
-    """The scanner that makes the scene's images; its tissue's mesh is for it to be told.
-
-    Raises:
-        SceneError: the scene's acoustics do not go with its volume.
-    """
+    """Build the scanner of the scene's images; `BMode.attach_mesh` gives it the tissue's mesh."""
     from us_sim.slicing.b_mode import BMode
 
     try:
@@ -154,24 +142,21 @@ def build_scanner(scene: Scene, volume: Volume, *, threads: int = 1) -> BMode:
 
 
 def build_collider(scene: Scene) -> Collider:
-    """The probe's shape that presses.
-
-    Raises:
-        SceneError: the scene has none.
-    """
-    section = scene.probe.collider
-    if section is None:
+    """Build the shape with which the probe presses; a scene without one is refused."""
+    if scene.probe.collider is None:
         raise SceneError(f"{scene.origin}: probe.collider: is missing")
-    shape: Collider = section.resolve_settings(COLLIDERS)
+    shape: Collider = scene.probe.collider.resolve_settings(COLLIDERS)
     return shape
 
 
 def build_tissue_model(
     scene: Scene, volume: Volume, note: Callable[[str], None] | None = None
 ) -> TissueModel:
-    """Mesh, materials, fixed nodes and collider of the scene's tissue.
+    """Build the model of the scene's tissue: mesh, materials, fixed nodes and collider.
 
     Args:
+        scene: with tissue.
+        volume: of the scene.
         note: called with a sentence on each thing about the mesh that was repaired or is unusual.
 
     Raises:
@@ -209,10 +194,14 @@ def build_materials(
     volume: Volume,
     fractions: LabelFractions | None = None,
 ) -> TissueMaterials:
-    """The constants of each tetrahedron, from materials by label name.
+    """Compute each tetrahedron's constants from the materials of the labels in it.
 
     Args:
-        fractions: `compute_label_fractions` mesh and volume, where they are known already.
+        scene: named in errors.
+        materials: by label names.
+        mesh: of the tissue.
+        volume: of the scene.
+        fractions: of the labels in each tetrahedron; None: they are computed.
 
     Raises:
         SceneError: a label of the volume has no material, or a material no label.
@@ -228,7 +217,7 @@ def build_materials(
 
 
 def compute_label_fractions(mesh: TetrahedralMesh, volume: Volume) -> LabelFractions | None:
-    """How much of each tetrahedron each label fills; None without labels."""
+    """Compute the part of each tetrahedron that each label fills; None without labels."""
     from us_sim.tissue.elasticity.materials import label_fractions
 
     if volume.labels is None:
@@ -239,13 +228,9 @@ def compute_label_fractions(mesh: TetrahedralMesh, volume: Volume) -> LabelFract
 def require_materials(
     scene: Scene, materials: Mapping[str, Material], label_names: Mapping[int, str] | None
 ) -> None:
-    """Check that each label has a material, and each material a label.
+    """Check that each label has a material and each material a label; raise SceneError if not.
 
-    Args:
-        label_names: by number; None where the volume has no labels, and needs one material.
-
-    Raises:
-        SceneError: one has none.
+    A volume without labels, whose ``label_names`` are None, needs one material named ``tissue``.
     """
     if label_names is None:
         if list(materials) != ["tissue"]:
@@ -269,12 +254,7 @@ def require_materials(
 
 
 def load_skin_surface(scene: Scene) -> TriangleSurface:
-    """The scene's skin at rest.
-
-    Raises:
-        SceneError: the scene has none.
-        MeshError: its file cannot be used.
-    """
+    """Load the scene's skin at rest from its file, or make it; a scene without one is refused."""
     from us_sim.skin import surface
 
     section = scene.skin
@@ -290,17 +270,16 @@ def load_skin_surface(scene: Scene) -> TriangleSurface:
 
 
 def build_membrane(scene: Scene, settings: MembraneSettings | None = None) -> SkinMembrane:
-    """The scene's skin, pressed by the scene's probe; with other settings where they are given."""
+    """Build the skin that the scene's probe presses, by these settings or else the scene's."""
     from us_sim.skin.membrane import SkinMembrane
 
-    sheet = load_skin_surface(scene)
-    return SkinMembrane(sheet, build_collider(scene), settings or scene.skin)
+    return SkinMembrane(load_skin_surface(scene), build_collider(scene), settings or scene.skin)
 
 
 def _build_mesh(
     scene: Scene, section: TissueSettings, volume: Volume
 ) -> tuple[TetrahedralMesh, tuple[str, ...], LabelFractions | None]:
-    """The mesh, remarks about it, and how much of each label is in it."""
+    """Read or make the mesh; return it, remarks about it, and the labels' parts in it."""
     given = section.mesh
     if given.file:
         from us_sim.tissue.mesh.file import read_mesh
@@ -335,7 +314,7 @@ def _find_fixed_nodes(
     volume: Volume,
     fractions: LabelFractions | None,
 ) -> tuple[NDArray[np.bool_], list[str]]:
-    """Nodes on the named faces and inside the named labels (the skeleton is rigid), and remarks."""
+    """Find the nodes on named faces and in named labels, as of bone; return a mask and remarks."""
     from us_sim.tissue.model import FACES, describe_held_nodes, face_nodes, nodes_in_label
 
     numbers = {name: label for label, name in volume.label_names.items()}
@@ -355,16 +334,7 @@ def _find_fixed_nodes(
 
 
 def build_tracking(scene: Scene, filter: PoseFilter | None = None) -> ProbeTracking:
-    """The tracking of the probe by the measurements of the scene's tracker.
-
-    Args:
-        scene: with the tracker.
-        filter: in place of the scene's.
-
-    Raises:
-        CalibrationError: a file of a registration or calibration cannot be used.
-        TrackingError: the times make no sense.
-    """
+    """Build the tracking of the probe by the scene's tracker, with another filter if given."""
     from us_sim.tracking.filters import create_filter
     from us_sim.tracking.probe_tracking import ProbeTracking
 
@@ -385,11 +355,7 @@ def build_tracking(scene: Scene, filter: PoseFilter | None = None) -> ProbeTrack
 
 
 def source_settings(scene: Scene, source: str) -> Any:
-    """The settings of a source of poses: the scene's where it names that source, else the defaults.
-
-    Raises:
-        TrackingError: there is no such source.
-    """
+    """Return the scene's settings of a source of poses, or the defaults of another source."""
     chosen = scene.tracker.source
     if chosen.name == source and chosen.given is not None:
         return chosen.given
@@ -397,21 +363,13 @@ def source_settings(scene: Scene, source: str) -> Any:
 
 
 def load_tracker_poses(scene: Scene) -> tuple[Pose, Pose]:
-    """Registration (the device in ``patient``) and calibration (the probe in the body).
-
-    Raises:
-        CalibrationError: a file of one of them cannot be used.
-    """
+    """Load registration (the device in ``patient``) and calibration (the probe in the body)."""
     tracker = scene.tracker
     return _pose_or_file(tracker.registration), _pose_or_file(tracker.calibration)
 
 
 def build_haptic_rendering(scene: Scene) -> HapticRendering:
-    """The rendering of the wrench on the handle of the scene's haptic arm.
-
-    Raises:
-        CalibrationError: a file of a registration or calibration cannot be used.
-    """
+    """Build the rendering of the wrench on the handle of the scene's haptic arm."""
     from us_sim.tracking.haptic import HapticDevice, HapticRendering
 
     settings = source_settings(scene, "haptic")
@@ -428,11 +386,7 @@ def _pose_or_file(given: Placement | str | None) -> Pose:
 
 
 def load_camera_body(scene: Scene) -> RigidBody:
-    """The markers on the probe that the scene's camera looks for.
-
-    Raises:
-        TrackingError: their file cannot be used.
-    """
+    """Load the markers on the probe that the scene's camera looks for."""
     from us_sim.tracking.camera.rigid_body import RigidBody, read_rigid_body
 
     settings = source_settings(scene, "camera")
@@ -451,17 +405,13 @@ class Structure:
 
 
 def structure_colour(scene: Scene, name: str) -> Colour:
-    """Red, green and blue of a structure: the scene's, or a usual one for its label's name."""
+    """Return a structure's red, green and blue: the scene's, or the usual ones of its label."""
     given = scene.structures[name]
     return given.colour or choose_colour(given.label or name)
 
 
 def require_labels(scene: Scene, label_names: Mapping[int, str]) -> None:
-    """Check that the volume has every label that the scene names, beside those of materials.
-
-    Raises:
-        SceneError: it has not.
-    """
+    """Refuse a scene that names a label which its volume lacks, materials left aside."""
     from us_sim.tissue.model import FACES
 
     held = enumerate(scene.tissue.fixed if scene.tissue else ())
@@ -487,14 +437,16 @@ def require_labels(scene: Scene, label_names: Mapping[int, str]) -> None:
 def build_structures(
     scene: Scene, volume: Volume, mesh: TetrahedralMesh, triangles: int
 ) -> Iterator[Structure]:
-    """Each structure of the scene, made and embedded one by one.
+    """Make and embed the scene's structures one by one.
+
+    Of a scene that is made from a case, structures that are nowhere in the tissue are left out.
 
     Args:
+        scene: with tissue.
         volume: of the scene.
         mesh: of the scene's tissue. Structures around labels end where it ends.
         triangles: about so many for all structures around labels together; files are taken as
-            they are. Of a scene that is made from a case, structures that are nowhere in the tissue
-            are left out.
+            they are.
 
     Raises:
         SceneError: the volume has no such label, or no surface can be made of it.
@@ -537,15 +489,7 @@ def build_structures(
 
 
 def build_blood(scene: Scene, volume: Volume) -> Blood:
-    """All vessels of a scene that have a flow.
-
-    Args:
-        volume: of the scene.
-
-    Raises:
-        SceneError: a structure with a flow is no tube, its flow leads across it, or the volume has
-            no such label; one sentence with file and key.
-    """
+    """Build the vessels of the scene that have a flow; refuse one that is no tube, or crossed."""
     from us_sim.slicing.flow.blood import Blood
     from us_sim.slicing.flow.vessel import Vessel
 

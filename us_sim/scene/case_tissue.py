@@ -41,14 +41,14 @@ leave a seam in the image."""
 _THINNEST = 0.02  # m, to which the tissue is cut where the volume ends
 _GENERATOR = 1
 """Part of the cache's key: raise it when a change here, or in what this calls, changes a mesh."""
+_STEPS = 160
+"""Places along the longest side of the box at which labels are read."""
+_IN_REACH = 0.015
+"""m: how far from the image's plane at rest structures count; the probe slides and tilts."""
 
 
 def make_case_document(folder: Path) -> dict[str, Any]:
-    """The keys of a scene made from the case in a folder.
-
-    Raises:
-        CaseError, VolumeError: the case cannot be read.
-    """
+    """Make the keys of a scene from the case in a folder."""
     case = read_case(folder)
     settings = case.settings
     if settings.start is None or settings.probe is None or settings.probe.collider is None:
@@ -59,7 +59,8 @@ def make_case_document(folder: Path) -> dict[str, Any]:
     assert settings.probe is not None
     names = [AROUND, *settings.structures] if case.has_labels else [AROUND]
     held = [name for name in settings.held if case.has_labels or name not in settings.structures]
-    pose = place_volume(settings.start)
+    start: Pose = settings.start.pose.inverse()
+    pose = Placement(tuple(start.position.tolist()), tuple(start.orientation.tolist()))
     document: dict[str, Any] = {
         "name": settings.name,
         "volume": {"case": str(case.folder), "pose": dump_settings(pose)},
@@ -93,22 +94,13 @@ def _pressing_path(settings: CaseSettings) -> str:
     return str(find_pressing_path(press, SLIDE if settings.slide is None else settings.slide))
 
 
-def place_volume(start: Placement) -> Placement:
-    """The pose of the volume's own frame in that of a probe at ``start``."""
-    pose: Pose = start.pose.inverse()
-    return Placement(tuple(pose.position.tolist()), tuple(pose.orientation.tolist()))
-
-
 def _mesh_document(case: Case, probe: ProbeSettings, pose: Placement) -> dict[str, Any]:
-    """The box of tissue: as wide and deep as the image, as far as the volume goes."""
+    """Make the box of tissue: as wide and deep as the image, cut to the volume."""
     matrix, shape = case.read_placement()
     volume = compute_grid_extent(pose.pose.matrix @ matrix, shape)
-    array = probe.array.resolve_settings(PROBES)
-    length, width = (
-        collider_footprint(probe.collider.resolve_settings(COLLIDERS))
-        if probe.collider
-        else (0.0, 0.0)
-    )
+    array, length, width = probe.array.resolve_settings(PROBES), 0.0, 0.0
+    if probe.collider:
+        length, width = collider_footprint(probe.collider.resolve_settings(COLLIDERS))
     aside = max(array.width / 2, length + _BESIDE)
     # m, along the probe's y: for its slide, and for tissue to give way
     across = max(0.03, 0.25 * array.depth, 2 * width)
@@ -124,15 +116,8 @@ def _mesh_document(case: Case, probe: ProbeSettings, pose: Placement) -> dict[st
     }
 
 
-_STEPS = 160
-"""Places along the longest side of the box at which labels are read."""
-
-_IN_REACH = 0.015
-"""m: how far from the image's plane at rest structures count; the probe slides and tilts."""
-
-
 def collider_footprint(collider: Collider) -> tuple[float, float]:
-    """Half the length and half the width (m, along the probe's x and y) of the collider."""
+    """Return half the collider's length and width, m along the probe's x and y."""
     if isinstance(collider, Sphere):
         return collider.radius, collider.radius
     if isinstance(collider, Capsule):
@@ -143,11 +128,7 @@ def collider_footprint(collider: Collider) -> tuple[float, float]:
 def compute_box_planes(
     scene: Scene, volume: Volume
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Mesh planes (m) along x, y, z of a box that may have so many nodes as the scene says.
-
-    Raises:
-        MeshError: they are too few.
-    """
+    """Compute the planes (m) along x, y, z of a box mesh of as many nodes as the scene says."""
     assert scene.tissue is not None
     assert scene.probe.collider is not None
     given = scene.tissue.mesh
@@ -166,7 +147,7 @@ def compute_box_planes(
 
 
 def is_refined(scene: Scene, label: str) -> bool:
-    """Whether planes are put close together for a label: not for held ones, nor for layers."""
+    """Return whether planes come close together for a label: a structure, not held, no layer."""
     assert scene.tissue is not None
     named = {given.label or name for name, given in scene.structures.items()}
     return (
@@ -177,24 +158,14 @@ def is_refined(scene: Scene, label: str) -> bool:
 
 
 def cache_tissue(scene: Scene, volume: Volume) -> None:
-    """Make the tissue of the scene's case, unless it is in the user's cache folder already.
-
-    Raises:
-        MeshError: no mesh can be made.
-    """
+    """Make the tissue of the scene's case, unless it is in the user's cache folder already."""
     tissue = scene.tissue
     if tissue is not None and not tissue.mesh.file and isinstance(tissue.mesh.nodes, int):
         build_box_tissue(scene, volume)
 
 
 def build_box_tissue(scene: Scene, volume: Volume) -> tuple[TetrahedralMesh, LabelFractions]:
-    """Return the box of a scene whose nodes are put where they count, and the labels in it.
-
-    That of a case is taken from the user's cache folder, and kept there.
-
-    Raises:
-        MeshError: no mesh can be made of so few nodes.
-    """
+    """Make the box of tissue, finest at structures, and the labels in it; a case's is kept."""
 
     def make() -> tuple[TetrahedralMesh, LabelFractions]:
         mesh = box_mesh(*compute_box_planes(scene, volume))
@@ -224,7 +195,7 @@ def _unpack(
 
 
 def _cache_key(scene: Scene) -> str:
-    """Return a file name of all that the tissue follows from."""
+    """Return a file name by a hash of all that the tissue follows from."""
     assert scene.tissue is not None
     assert scene.probe.collider is not None
     assert scene.volume.case is not None

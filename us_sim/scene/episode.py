@@ -68,7 +68,7 @@ class DrawRanges(Settings):
     )
 
     def check(self) -> None:
-        """Ranges go up."""
+        """Require ranges that go up."""
         for name in rules_of(type(self)):
             low, high = getattr(self, name)
             if low > high:

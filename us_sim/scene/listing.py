@@ -1,4 +1,4 @@
-"""Scenes and cases that can be loaded, each described for a person."""
+"""The list of scenes and cases that can be loaded, each described for a person."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ListedScene:
 
 
 def list_scenes() -> Iterator[ListedScene]:
-    """List exercises that name a scene, installed scenes, cases of `list_case_roots`; each name once."""
+    """List exercises that name a scene, installed scenes, and cases; each name once."""
     from us_sim.scoring.exercise import read_installed_exercises
     from us_sim.volume.cases.case import find_cases, list_case_roots
 
@@ -51,7 +51,7 @@ def list_scenes() -> Iterator[ListedScene]:
 
 
 def describe_scene(name: str) -> ListedScene:
-    """The entry of a scene, or of ``case:`` and a case."""
+    """Describe a scene, or a case after ``case:``; a fault of it is its entry's ``problem``."""
     if name.startswith(CASE_PREFIX):
         return _describe_case(Path(name.removeprefix(CASE_PREFIX)))
     try:

@@ -1,4 +1,4 @@
-"""Images in the volume: where they show tissue at rest, and whether they show any of it."""
+"""Placing images in the volume: at rest, as if nothing pressed, or along a probe's path."""
 
 from __future__ import annotations
 
@@ -34,16 +34,12 @@ _MOST_FRAMES = 60
 
 
 def build_rest_placement(scene: Scene, sweep: TrackedSweep, part: ImagePart) -> RestPlacement:
-    """The placement at rest of a sweep's frames.
+    """Build the placement at rest of a sweep's frames.
 
     Args:
         scene: with tissue and a collider; its frame ``patient`` is the sweep's reference frame.
         sweep: with poses.
         part: of the image; the probe's face is at its top.
-
-    Raises:
-        SceneError: the scene has no tissue.
-        UsSimError: its parts cannot be made.
     """
     if scene.tissue is None:
         raise SceneError(
@@ -58,7 +54,7 @@ def build_rest_placement(scene: Scene, sweep: TrackedSweep, part: ImagePart) -> 
 
 
 def find_probe_pose(image_to_reference: NDArray[np.float64], part: ImagePart, columns: int) -> Pose:
-    """Of the probe whose image this is: its face is at the top middle of the image's part."""
+    """Return the pose of the probe whose face is at the top middle of the image's part."""
     top = np.array([0.5 * (columns - 1), -0.5, 0.0, 1.0])  # the upper edge of the first row
     if part.fan_origin is not None and part.fan_radius is not None:
         top[:2] = part.fan_origin[0], part.fan_origin[1] + part.fan_radius[0]
@@ -75,7 +71,7 @@ def find_probe_pose(image_to_reference: NDArray[np.float64], part: ImagePart, co
 
 @dataclass
 class RestPlacement:
-    """Takes points of a frame to where their tissue lies at rest.
+    """Maps points of a frame to the places of their tissue at rest.
 
     Args:
         solver: of the tissue.
@@ -88,7 +84,7 @@ class RestPlacement:
     _nodes: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)), init=False)
 
     def __call__(self, frame: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N, 3) m at rest, of points (N, 3) m seen in a frame; nan outside the tissue."""
+        """Return the places at rest (N, 3) m of points (N, 3) m in a frame; nan outside tissue."""
         if frame != self._frame:
             self._frame, self._nodes = frame, self._deform(self.poses[frame])
         mesh = self.solver.model.mesh
@@ -104,7 +100,7 @@ class RestPlacement:
         return np.asarray(rest, dtype=np.float64)
 
     def _deform(self, pose: Pose) -> NDArray[np.float64]:
-        """The nodes (N, 3) m under a held probe."""
+        """Deform the tissue until it is at rest under a held probe; return its nodes (N, 3) m."""
         for _ in range(_MOST_FRAMES):
             deformation = self.solver.deform(pose)
             if self.solver.is_settled:
@@ -126,7 +122,7 @@ def compute_part_inside(
     shape: tuple[int, ...],
     intensities: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.float64]:
-    """(N,) how much of the image at each pose is inside of the volume's voxels.
+    """Compute the part (N,) of the image at each pose that lies inside the volume's voxels.
 
     Args:
         probe: whose image it is.
@@ -155,12 +151,7 @@ def compute_part_inside(
 def check_path_in_volume(
     scene: Scene, file: Path, volume: Volume, topic: str | None = None
 ) -> None:
-    """Refuse a path of which no image shows any of the volume.
-
-    Raises:
-        SceneError: with where the volume is, and where the images are.
-        BagError: the path cannot be read.
-    """
+    """Refuse a path of which no image shows any of the volume; say where both are."""
     poses, probe = _sample_poses(scene, load_path(scene, file, topic)), build_probe(scene)
     scanned = volume.intensities if volume.intensities.any() else None  # black at any pose
     shown = compute_part_inside(probe, poses, volume.patient_to_index, volume.shape, scanned)

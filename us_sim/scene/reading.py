@@ -1,4 +1,4 @@
-"""Reading a scene file: YAML, merged with the scene it is based on, every key and value checked.
+"""Reading scene files: YAML, merged with the scene it is based on, every key and value checked.
 
 >>> from us_sim.scene.reading import check_files, merge_documents, parse_scene
 >>> merge_documents({"probe": {"depth": "4 cm", "lines": 128}, "skin": {}},
@@ -6,7 +6,7 @@
 {'probe': {'depth': '6 cm', 'lines': 128}}
 >>> scene = parse_scene({"name": "bare", "volume": {"phantom": "upper_arm"},
 ...                      "probe": {"aperture": "40 mm", "depth": "40 mm"}})
->>> [part.node for part in scene.parts() if part.needed]
+>>> [part.node for part in scene.list_parts() if part.needed]
 ['probe_tracker', 'slice_interpolator']
 >>> check_files(scene)
 []
@@ -48,10 +48,11 @@ BASE = "based_on"
 def read_document(
     path: Path, find: Callable[[str | Path], Path], seen: tuple[Path, ...] = ()
 ) -> tuple[Any, list[Path]]:
-    """The document of a scene file, and the folders in which its relative files are looked up.
+    """Read a scene file and its bases; return the document, and the folders of relative files.
 
     Args:
-        find: gives the file of the scene of a name.
+        path: of the file.
+        find: returns the file of the scene of a name.
         seen: files that are based on this one.
 
     Raises:
@@ -79,11 +80,11 @@ def read_document(
 
 
 def merge_documents(below: dict[Any, Any], above: dict[Any, Any]) -> dict[Any, Any]:
-    """``below`` overridden by ``above``: mappings key by key, anything else replaced.
+    """Override ``below`` by ``above``: mappings key by key, anything else replaced.
 
-    Where ``above`` chooses another kind of probe, collider, filter, ..., what only some kinds have
-    goes with the one below; where it names a file in place of a box, the box goes. ``null`` takes
-    back what ``below`` says.
+    If ``above`` chooses another kind of probe, collider, filter, ..., the keys below that not all
+    kinds have go; if it names a file in place of a box, the box goes. ``null`` takes back what
+    ``below`` says.
     """
     return _merge(below, above, Scene)
 
@@ -95,10 +96,9 @@ def _merge(
     choice: Choice | None = None,
     each: Any = None,
 ) -> dict[Any, Any]:
-    """Two mappings merged, of the settings or the choice whose keys they hold.
+    """Merge mappings whose keys are those of ``settings`` or of ``choice``.
 
-    Args:
-        each: the type of what is under any key, where keys are names that a person chose.
+    Keys may also be names that a person chose; then ``each`` is the type of every value.
     """
     gone = _dropped_keys(below, above, choice) if choice else set()
     rules = rules_of(settings) if settings else {}
@@ -127,7 +127,7 @@ def _merge(
 
 
 def _replaced_keys(above: dict[Any, Any], alternatives: Mapping[str, tuple[str, ...]]) -> set[str]:
-    """The keys in whose place ``above`` names something, if it names one thing."""
+    """Return the keys that go since ``above`` names the alternative to them."""
     named = [name for name in alternatives if above.get(name) is not None]
     if len(named) != 1:
         return set()
@@ -140,7 +140,7 @@ def _is_choice_changed(below: dict[Any, Any], above: dict[Any, Any], choice: Cho
 
 
 def _dropped_keys(below: dict[Any, Any], above: dict[Any, Any], choice: Choice) -> set[str]:
-    """The keys that not all options have, if another option is chosen."""
+    """Return the keys that not all options have, if ``above`` chooses another option."""
     if not _is_choice_changed(below, above, choice):
         return set()
     keys = [set(rules_of(choice.load_settings(name))) for name in choice.names]
@@ -191,19 +191,7 @@ def check_files(scene: Scene) -> list[str]:
 
             read_surface(file)
             checked.append(key)
-    tracker = scene.tracker
-    build_tracking(scene)
-    checked += [
-        f"tracker.{key}"
-        for key in ("registration", "calibration")
-        if isinstance(getattr(tracker, key), str)
-    ]
-    if tracker.source.name == "camera" and source_settings(scene, "camera").body:
-        load_camera_body(scene)
-        checked.append("tracker.camera.body")
-    if tracker.source.name == "path" and tracker.file:
-        load_path(scene, Path(tracker.file))
-        checked.append("tracker.file")
+    checked += _check_tracker_files(scene)
     checked += ["exercise"] if scene.exercise else []
     if scene.path:
         from us_sim.recording.path import read_path
@@ -213,12 +201,23 @@ def check_files(scene: Scene) -> list[str]:
     return checked
 
 
-def check_structure_names(scene: Scene) -> None:
-    """Check that the volume has what the scene and its exercise name, without reading it.
+def _check_tracker_files(scene: Scene) -> list[str]:
+    """Read the files that the scene's tracker names; return their keys."""
+    tracker = scene.tracker
+    build_tracking(scene)
+    poses = ("registration", "calibration")
+    checked = [f"tracker.{key}" for key in poses if isinstance(getattr(tracker, key), str)]
+    if tracker.source.name == "camera" and source_settings(scene, "camera").body:
+        load_camera_body(scene)
+        checked.append("tracker.camera.body")
+    if tracker.source.name == "path" and tracker.file:
+        load_path(scene, Path(tracker.file))
+        checked.append("tracker.file")
+    return checked
 
-    Raises:
-        UsSimError: it lacks one, or the names cannot be read.
-    """
+
+def check_structure_names(scene: Scene) -> None:
+    """Refuse names of the scene and its exercise that the volume lacks, without reading it."""
     names = _label_names(scene)
     require_labels(scene, names or {})
     if scene.tissue is not None:
@@ -237,7 +236,7 @@ def check_structure_names(scene: Scene) -> None:
 
 
 def _label_names(scene: Scene) -> Mapping[int, str] | None:
-    """The labels' names by their numbers, without the volume; None where it has no labels."""
+    """Read the labels' names, by numbers, without the volume; None if it has no labels."""
     if scene.volume.case:
         from us_sim.volume.cases.case import read_case
 
@@ -252,7 +251,7 @@ def _label_names(scene: Scene) -> Mapping[int, str] | None:
 
 
 def _mesh_remarks(tissue: TissueSettings) -> list[str]:
-    """Remarks about the mesh of a file that can be told without the volume."""
+    """List the remarks about a mesh's file that need no volume."""
     from us_sim.tissue.mesh.file import read_mesh
     from us_sim.tissue.model import FACES, describe_held_nodes, face_nodes
 
@@ -264,7 +263,7 @@ def _mesh_remarks(tissue: TissueSettings) -> list[str]:
 
 
 def find_installed_scenes() -> dict[str, Path]:
-    """The files in ``config/scenes``, by name."""
+    """Find the files in ``config/scenes``, by name."""
     known: dict[str, Path] = {}
     for root in shared_roots():
         for file in sorted((root / "config" / "scenes").glob("*.yaml")):
@@ -273,7 +272,7 @@ def find_installed_scenes() -> dict[str, Path]:
 
 
 def find_scene(name: str | Path) -> Path:
-    """The scene file of that path, or of that name in ``config/scenes``.
+    """Find the scene file of a path, or of a name in ``config/scenes``.
 
     Raises:
         SceneError: there is no such file; the sentence lists the installed scenes.
@@ -287,9 +286,8 @@ def find_scene(name: str | Path) -> Path:
         return known[stem]
     from us_sim.scoring.exercise import find_exercise_files
 
-    like = (
-        f"{EXERCISE_PREFIX}{stem}" if stem in find_exercise_files() else find_closest(stem, known)
-    )
+    is_exercise = stem in find_exercise_files()
+    like = f"{EXERCISE_PREFIX}{stem}" if is_exercise else find_closest(stem, known)
     hint = f"; did you mean {like}?" if like else ""
     raise SceneError(
         f"there is no scene file {name}; installed scenes are {', '.join(known)}{hint}"
@@ -314,11 +312,7 @@ def load_scene(name: str | Path, *, volume: str | Path | None = None) -> Scene:
 
 
 def read_scene_document(name: str | Path) -> tuple[Any, list[Path], str]:
-    """Return the document of a scene, case or exercise, the folders of its files, its origin.
-
-    Raises:
-        SceneError: it cannot be found or read.
-    """
+    """Read the document of a scene, case or exercise; also the folders of its files, and origin."""
     if str(name).startswith(CASE_PREFIX):
         case = str(name).removeprefix(CASE_PREFIX)
         try:
@@ -334,10 +328,9 @@ def read_scene_document(name: str | Path) -> tuple[Any, list[Path], str]:
 
 
 def _read_exercise_document(name: str) -> tuple[Any, list[Path], str]:
-    """Return the document of an exercise's scene, its folders, and an origin with the seed drawn.
+    """Read the document of an exercise's scene, its folders, and its origin with the seed.
 
-    Args:
-        name: of the exercise, or its file; behind a ``#`` the seed, else one is drawn.
+    The seed stands behind a ``#`` in the name, or is drawn.
     """
     from us_sim.scoring.exercise import read_exercise
 
@@ -362,23 +355,19 @@ def _read_exercise_document(name: str) -> tuple[Any, list[Path], str]:
 
 
 def with_volume(document: dict[Any, Any], file: str) -> dict[Any, Any]:
-    """The document with another volume in place of its own."""
+    """Return the document with another volume in place of its own."""
     return merge_documents(document, {"volume": {"file": file}})
 
 
 def with_path(document: dict[Any, Any], file: str) -> dict[Any, Any]:
-    """The document with another probe path in place of its own, and of its tracker's recording."""
+    """Return the document with another path in place of its own and of its tracker's file."""
     tracker = document.get("tracker") or {}
     plays = {"tracker": {"file": file}} if tracker.get("source") == "path" else {}
     return merge_documents(document, {"path": file, **plays})
 
 
 def parse_scene(document: object, *, origin: str = "scene", folders: Sequence[Path] = ()) -> Scene:
-    """Validate an already read document; relative files are looked up in ``folders``.
-
-    Raises:
-        SceneError: see :func:`load_scene`.
-    """
+    """Validate a document as `load_scene` does; relative files are looked up in ``folders``."""
     if document is None:
         raise SceneError(f"{origin}: is empty; a scene has at least name, volume and probe")
 
@@ -387,12 +376,10 @@ def parse_scene(document: object, *, origin: str = "scene", folders: Sequence[Pa
 
     document = _with_case(document, origin, [*folders, Path.cwd()])
     document = _with_named_structures(document)
-    SettingsReader(origin, None, SceneError).read(
-        Scene, document
-    )  # files matter once all else is right
-    scene = replace(
-        SettingsReader(origin, find_file, SceneError).read(Scene, document), origin=origin
-    )
+    # Files matter once all else is right.
+    SettingsReader(origin, None, SceneError).read(Scene, document)
+    read: Scene = SettingsReader(origin, find_file, SceneError).read(Scene, document)
+    scene = replace(read, origin=origin)
     probe = build_probe(scene)
     if scene.imaging.acoustics.is_live:
         try:
@@ -403,7 +390,7 @@ def parse_scene(document: object, *, origin: str = "scene", folders: Sequence[Pa
 
 
 def _with_case(document: object, origin: str, folders: Sequence[Path]) -> object:
-    """A document that names a case has all that the case says and it does not say itself."""
+    """Complete a document that names a case by what the case says."""
     case = document.get("case") if isinstance(document, dict) else None
     if not isinstance(document, dict) or not isinstance(case, str) or not case.strip():
         return document
@@ -416,7 +403,7 @@ def _with_case(document: object, origin: str, folders: Sequence[Path]) -> object
 
 
 def _with_named_structures(document: object) -> object:
-    """Structures that have nothing but a name may be a list of names, or keys without a value."""
+    """Turn a list of structures' names, and names without a value, into empty mappings."""
     if not isinstance(document, dict) or "structures" not in document:
         return document
     given = document["structures"]
@@ -428,7 +415,7 @@ def _with_named_structures(document: object) -> object:
 
 
 def _find_case(name: str, folders: Sequence[Path] = ()) -> Path:
-    """As `find_case`, imported only where a scene names a case: it brings kinds of tissue along."""
+    """Find a case's folder; the import is made late since it brings kinds of tissue along."""
     from us_sim.volume.cases.case import find_case
 
     return find_case(name, folders)

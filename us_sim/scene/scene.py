@@ -65,7 +65,7 @@ class TissueSettings(Settings):
     )
 
     def check(self) -> None:
-        """Something is made of something."""
+        """Require a material."""
         if not self.materials:
             raise self.make_error("materials", "names no material")
 
@@ -94,7 +94,7 @@ class StructureSettings(Settings):
     )
 
     def check(self) -> None:
-        """A label or a file."""
+        """Require a label or a file, and settings that go with it."""
         if self.file and self.flow:
             raise self.make_error(
                 "flow", "is for structures around a label, in which there is room for blood"
@@ -165,7 +165,7 @@ class TrackerSettings(Settings):
     gate: GateSettings | None = setting(description="which poses are not believed", default=None)
 
     def check(self) -> None:
-        """The times go together."""
+        """Require that a probe coasts before it is lost."""
         if self.lost_after < self.coast_for:
             raise self.make_error(
                 "lost_after",
@@ -185,7 +185,7 @@ class ImagingSettings(Imaging):
 
 @dataclass(frozen=True)
 class Part:
-    """A node of the graph, whether this scene needs it, and why."""
+    """A node of the graph that this scene needs or not, and why."""
 
     node: str
     needed: bool
@@ -249,7 +249,7 @@ class Scene(Settings):
     origin: str = "scene"
 
     def check(self) -> None:
-        """Sections that need each other are there."""
+        """Require sections that others need."""
         for key, user in (("tissue", "tissue"), ("skin", "skin")):
             if getattr(self, key) is not None and self.probe.collider is None:
                 raise self.make_error(
@@ -261,7 +261,7 @@ class Scene(Settings):
             raise self.make_error("strain", "needs `tissue` to be strained, and it is missing")
 
     def list_parts(self) -> list[Part]:
-        """Every simulation node with the reason why it runs or is left out."""
+        """List the simulation's nodes, each with the reason why it runs or is left out."""
         is_felt, felt = self.tracker.source.name == "haptic", ("tissue", "nothing can be felt")
         return [
             Part("probe_tracker", True, f"poses come from `{self.tracker.source.name}`"),
@@ -276,7 +276,7 @@ class Scene(Settings):
 
     @property
     def flows(self) -> dict[str, FlowSettings]:
-        """Of the blood in structures, by their names."""
+        """Flows of the blood in structures, by the structures' names."""
         return {name: given.flow for name, given in self.structures.items() if given.flow}
 
     @property
@@ -287,12 +287,9 @@ class Scene(Settings):
         return topics + (["skin/nodes"] if self.skin else [])
 
     def _describe_imaging(self) -> str:
-        """How images are made, for a person."""
-        asked = [
-            entry.name
-            for entry in fields(Imaging)
-            if getattr(self.imaging, entry.name) != entry.default
-        ]
+        """Describe for a person how images are made."""
+        own = self.imaging
+        asked = [each.name for each in fields(Imaging) if getattr(own, each.name) != each.default]
         if self.imaging.acoustics.is_live:
             asked.append("artefacts along the beams")
         formed = f"formed with {', '.join(asked)}" if asked else "shown as they are cut"
@@ -300,7 +297,7 @@ class Scene(Settings):
         return f"{self.probe.geometry} images are cut by `{self.slice.name}`, {formed}{blood}"
 
     def solver_settings(self, name: str) -> Any:
-        """The scene's settings of a solver, or None."""
+        """Return the scene's settings of a solver, or None."""
         return self.tissue.settings.get(name) if self.tissue else None
 
 
