@@ -1,8 +1,7 @@
 """Arrays kept in the user's cache folder, memory-mapped and shared by processes.
 
-An entry is a folder of .npy files and a description. It is written beside its place and renamed
-there, so it is whole or absent; a lock lets one process make it while others wait; and what cannot
-be read all the same is made again.
+An entry is a folder of .npy files and a description. It is renamed to its place when it is whole.
+A lock lets one process make it while others wait. What cannot be read is made again.
 
 >>> import os, tempfile
 >>> import numpy as np
@@ -35,12 +34,11 @@ Thing = TypeVar("Thing")
 Arrays = dict[str, NDArray[Any]]
 Facts = dict[str, Any]
 
-_FACTS = "facts.json"  # file beside the arrays
 _logger = logging.getLogger(__name__)
 
 
 def cache_folder() -> Path:
-    """Where things are kept: US_SIM_CACHE, or the user's cache folder on this system."""
+    """Return US_SIM_CACHE, or the user's cache folder on this system."""
     given = os.environ.get("US_SIM_CACHE")
     return Path(given) if given else platformdirs.user_cache_path("us_sim")
 
@@ -51,10 +49,7 @@ def load_or_create(
     unpack: Callable[[Arrays, Facts], Thing],
     make: Callable[[], Thing],
 ) -> Thing:
-    """Return the thing kept under a key, made and kept first if it is not there.
-
-    Where the cache folder cannot be written, the thing is made, used from memory, and a warning
-    says so.
+    """Load the thing kept under a key, or make and keep it; warn if the folder cannot be written.
 
     Args:
         key: a file name that says all that decides the thing's bytes.
@@ -88,9 +83,8 @@ def _load(
     if not entry.exists():
         return None
     try:
-        facts = json.loads((entry / _FACTS).read_text(encoding="utf-8"))
-        # Mapped, so that only what is used takes memory; and a plain array over the map, since a
-        # subclass would slow and surprise callers.
+        facts = json.loads((entry / "facts.json").read_text(encoding="utf-8"))
+        # Plain arrays over the maps: a subclass would slow and surprise callers.
         files = entry.glob("*.npy")
         arrays = {file.stem: np.asarray(np.load(file, mmap_mode="r")) for file in files}
         return unpack(arrays, facts)
@@ -108,7 +102,7 @@ def _store(entry: Path, arrays: Arrays, facts: Facts) -> None:
         partial.mkdir()
         for name, array in arrays.items():
             np.save(partial / f"{name}.npy", array)
-        (partial / _FACTS).write_text(json.dumps(facts, indent=1), encoding="utf-8")
+        (partial / "facts.json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
         shutil.rmtree(entry, ignore_errors=True)  # damaged
         partial.rename(entry)
     finally:

@@ -1,15 +1,12 @@
 """Errors that reach a person: each is one sentence with the fault, its place, and a remedy."""
 
-LONGEST = 2000
-"""Characters of a sentence: it may quote a file or a message."""
 
-
-def printable_line(text: str, longest: int = LONGEST) -> str:
-    """The text on one line, of nothing that a terminal obeys, without its middle if it is long.
+def printable_line(text: str, longest: int = 2000) -> str:
+    r"""Return the text on one line without control characters; a long one loses its middle.
 
     The end stays, since it says what is wrong and what to do.
 
-    >>> printable_line("a \\x1b[31mname\\nof a stranger", 20)
+    >>> printable_line("a \x1b[31mname\nof a stranger", 20)
     'a ?[31mnam … a stranger'
     """
     half = longest // 2
@@ -20,13 +17,11 @@ def printable_line(text: str, longest: int = LONGEST) -> str:
 class UsSimError(Exception):
     """Base of every error that this package raises for bad input."""
 
-    key: str = ""
-    """The setting that is wrong, where it is one: its path of keys below the section."""
-    problem: str = ""
-    """The fault of that key."""
+    key: str = ""  # of the setting that is wrong, below its section; empty where it is none
+    problem: str = ""  # the fault of that key
 
     def __str__(self) -> str:
-        """The sentence in one line, whatever the names in it are made of."""
+        """Return the sentence in one printable line."""
         return printable_line(super().__str__())
 
 

@@ -1,8 +1,8 @@
 """Kernels: numba's `njit`, whose compiled code is kept for these very sources.
 
-Numba's own cache compiles a kernel anew where its file changed, but not where a function that it
-calls did. So its folder is named by all sources that can become part of a kernel. `NUMBA_CACHE_DIR`
-names another place for that folder than `kernels` in that of `us_sim.cache`.
+Numba compiles a kernel anew if its file changed, but not if a function that it calls did. So the
+cache's folder is named by a hash of all such sources. It is below `NUMBA_CACHE_DIR`, or `kernels`
+in the folder of `us_sim.cache`.
 
 >>> from us_sim.kernels import njit
 >>> @njit(nogil=True)  # and cache=True in a module; an example like this has no file
@@ -33,15 +33,12 @@ from numba.core import config
 from us_sim import __version__
 from us_sim.cache import cache_folder
 
-_KEPT = 4  # folders of other sources, such as those of another checkout
-_IN_USE = 86400.0  # s after a process began with a folder, in which it is not removed
-
 # A wrapper for C is a second copy of a kernel, and nothing here is called from C.
 njit: Any = partial(numba.njit, no_cfunc_wrapper=True)
 
 
 def enable_kernel_cache() -> Path:
-    """Have numba keep what it compiles in the folder of these sources; remove long unused ones."""
+    """Have numba keep what it compiles in these sources' folder; remove old ones of others."""
     place = Path(getattr(config, "CACHE_DIR", "") or cache_folder() / "kernels")
     sources = b"".join(map(Path.read_bytes, find_kernel_sources()))
     name = f"us_sim-{__version__}-{source_hash(sources).hex()}"
@@ -57,19 +54,17 @@ def enable_kernel_cache() -> Path:
         atexit.register(shutil.rmtree, place, ignore_errors=True)
         os.environ["NUMBA_CACHE_DIR"] = str(place)  # for the processes that this one starts
     with contextlib.suppress(OSError):  # another process removes them, too
-        others = sorted(place.glob("us_sim-*"), key=os.path.getmtime)[: -1 - _KEPT]
-        for folder in others:
-            if time.time() - os.path.getmtime(folder) > _IN_USE:
+        for folder in sorted(place.glob("us_sim-*"), key=os.path.getmtime)[:-5]:
+            if time.time() - os.path.getmtime(folder) > 86400.0:  # else it may be in use
                 shutil.rmtree(folder, ignore_errors=True)
     config.CACHE_DIR = str(place / name)  # type: ignore[attr-defined]
     return place / name
 
 
 def find_kernel_sources() -> list[Path]:
-    """The package's files that name numba or a kernel; no other has a part in any."""
-    named = re.compile(rb"numba|kernel")
+    """Find the package's files that name numba or a kernel; no other has a part in any."""
     files = sorted(Path(__file__).parent.rglob("*.py"))
-    return [file for file in files if named.search(file.read_bytes())]
+    return [file for file in files if re.search(rb"numba|kernel", file.read_bytes())]
 
 
 enable_kernel_cache()

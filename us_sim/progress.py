@@ -10,20 +10,13 @@ from tqdm import tqdm
 
 from us_sim.errors import printable_line
 
-_LONGEST = 200  # characters of what is being done
-_PATIENCE = 1.0  # s, for which work goes on without a bar
-
 
 class Progress(tqdm):
     """A bar on stderr from 0 to ``total``; without a total, only the text.
 
     Where stderr is no terminal it writes a line every few seconds instead.
 
-    Args:
-        description: of the work.
-        total: amount of work.
-        unit: of the amount.
-        delay: s, before which nothing is drawn.
+    Nothing is drawn before ``delay`` s have passed.
     """
 
     def __init__(
@@ -42,22 +35,21 @@ class Progress(tqdm):
         )
 
     def update(self, done: float, text: str = "") -> None:  # type: ignore[override]
-        """Show that ``done`` of the total is done."""
-        self.set_postfix_str(printable_line(text, _LONGEST), refresh=False)
+        """Show that ``done`` of the total is done, and what is being done."""
+        self.set_postfix_str(printable_line(text, 200), refresh=False)
         super().update((done if self.total is None else min(done, self.total)) - self.n)
 
 
 def late_progress(description: str) -> Callable[[float, str], None]:
-    """Return a callback for work that is mostly short: it draws a bar once a second has passed.
+    """Return a function of the fraction done and what is done; it draws a bar after a second.
 
-    It takes the fraction done and what is being done. At 1 the bar is finished, and the next call
-    begins another.
+    At 1 the bar is finished, and the next call begins another.
     """
     bar: Progress | None = None
 
     def show(fraction: float, text: str) -> None:
         nonlocal bar
-        bar = bar or Progress(description, 100, "%", delay=_PATIENCE)
+        bar = bar or Progress(description, 100, "%", delay=1.0)
         bar.update(100 * fraction, text)
         if fraction >= 1.0:
             bar.close()
@@ -67,6 +59,6 @@ def late_progress(description: str) -> Callable[[float, str], None]:
 
 
 def end_late_bars() -> None:
-    """End the lines of bars whose work was broken off, so that a sentence begins on its own."""
+    """End the lines of bars whose work was broken off, so that a sentence begins a new one."""
     for bar in [*tqdm._instances]:  # type: ignore[attr-defined]
         bar.close()

@@ -1,4 +1,4 @@
-"""Where the installed scenes, launch file, layouts and probe paths lie."""
+"""Paths of the installed scenes, launch file, layouts and probe paths."""
 
 from __future__ import annotations
 
@@ -11,22 +11,17 @@ from us_sim.errors import UsSimError
 
 
 def full_path(name: str | Path) -> Path:
-    """The absolute path of a text, with ``~`` expanded and links followed.
-
-    Unlike `Path.resolve` and `Path.expanduser` it never fails: links that lead in a circle, and
-    the home of nobody, are left for whoever opens the file to refuse.
-    """
+    """Expand ``~`` and follow links; unlike `Path`'s methods it leaves a wrong path as it is."""
     return Path(os.path.realpath(os.path.expanduser(name)))
 
 
 def shared_roots() -> Iterator[Path]:
-    """Folders that may hold ``config`` and ``bags``: the checkout, ROS 2 prefixes, pip's share."""
+    """Yield folders with ``config`` and ``bags``: the checkout, ROS 2 prefixes, pip's share."""
     checkout = Path(__file__).resolve().parents[1]
     if (checkout / "package.xml").is_file():
         yield checkout
-    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
-        if prefix:
-            yield Path(prefix) / "share" / "us_sim"
+    for prefix in filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)):
+        yield Path(prefix) / "share" / "us_sim"
     try:
         distribution = importlib.metadata.distribution("us_sim")
     except importlib.metadata.PackageNotFoundError:
@@ -37,11 +32,7 @@ def shared_roots() -> Iterator[Path]:
 
 
 def shared_path(relative: str) -> Path:
-    """The first existing ``relative`` path among :func:`shared_roots`.
-
-    Raises:
-        UsSimError: no root has it.
-    """
+    """Return the first of :func:`shared_roots` that has it, joined with ``relative``."""
     roots = list(shared_roots())
     for root in roots:
         if (root / relative).exists():
@@ -53,7 +44,7 @@ def shared_path(relative: str) -> Path:
 
 
 def find_bag(name: str | Path) -> Path:
-    """The bag at that path, or the installed one of that name."""
+    """Return the path of a bag, or of the installed one of that name."""
     path = Path(os.path.expanduser(name))
     if not os.path.exists(path) and path.name == str(name):
         for root in shared_roots():
