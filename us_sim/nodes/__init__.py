@@ -1,9 +1,7 @@
-"""The rclpy nodes. Importing this package imports no rclpy.
+"""The rclpy nodes; tables of topics and parameters can be read without rclpy.
 
-So tables of topics and parameters can be read without one. It ends a node's process without a word
-when Ctrl-C comes while its modules are imported: an import that a KeyboardInterrupt breaks off
-fails in ways of its own, with pages of traceback. `us_sim.nodes.process.run_node` takes over once
-it runs.
+Importing this package in a node's process ends it silently on Ctrl-C, since an import that is
+broken off prints pages of traceback. `us_sim.nodes.process.run_node` takes over once it runs.
 """
 
 from __future__ import annotations
@@ -30,14 +28,10 @@ INTERRUPTED = 130  # the exit status of a node that was told to end before its w
 
 
 def require_rclpy() -> None:
-    """Require one rclpy of one ROS 2, without importing it.
+    """Require one rclpy of one ROS 2 and of this Python, without importing it.
 
     rclpy's wheels start the interpreter again with their libraries on LD_LIBRARY_PATH, in any order
-    with those of a sourced ROS 2, and not where a parent process has done so already.
-
-    Raises:
-        UsSimError: rclpy is not installed, of another Python, or mixed of two installations; says
-            what to do.
+    with those of a sourced ROS 2, and not if a parent process has done so already.
     """
     found = importlib.util.find_spec("rclpy")
     if found is None or found.origin is None:
@@ -71,16 +65,13 @@ def require_rclpy() -> None:
 
 
 def announce_often() -> None:
-    """Have Fast DDS announce nodes twice a second, not every 3 s, unless a profile is set.
-
-    Nodes that are started again are soon heard.
-    """
+    """Have Fast DDS announce nodes twice a second, not every 3 s, unless a profile is set."""
     profile = shared_path("config/fast_dds.xml")
     os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile))
 
 
 def explain_ros_error(error: Exception) -> UsSimError:
-    """Return what rcl refused as one sentence, with what a secured domain needs."""
+    """Return an error of rcl as one sentence, with what a secured domain needs."""
     sentence = f"ROS cannot be used: {' '.join(str(error).split())}"
     if os.environ.get("ROS_SECURITY_ENABLE") == "true":
         sentence += (
@@ -91,7 +82,7 @@ def explain_ros_error(error: Exception) -> UsSimError:
 
 
 def prepare_process(name: str) -> None:
-    """Bear the node's name, require rclpy, and end at once on Ctrl-C."""
+    """Give the process the node's name, require rclpy, and have Ctrl-C end it at once."""
     with contextlib.suppress(ImportError):  # a node works without a name in `ps`
         from setproctitle import setproctitle
 
@@ -106,7 +97,7 @@ def prepare_process(name: str) -> None:
 
 
 def node_name(command: list[str]) -> str:
-    """Return the node that a command line runs, as a module or by colcon's script, or nothing.
+    """Return the node that a command line runs as a module or by colcon's script, or nothing.
 
     >>> node_name(["python3", "-X", "dev", "-m", "us_sim.nodes.path_player", "--ros-args"])
     'path_player'

@@ -1,4 +1,4 @@
-"""A camera without ROS's own drivers: OpenCV's images with the calibration that belongs to them."""
+"""A driver for cameras and videos: OpenCV's images with their calibration."""
 
 from __future__ import annotations
 
@@ -23,18 +23,17 @@ from us_sim.share import full_path
 from us_sim.tracking.camera.model import CameraModel, read_camera_info
 from us_sim.tracking.camera.source import VideoSource
 
-CHECK_S = 0.05  # how often it is looked for a subscriber
-RETRY_S = 1.0  # how long a camera that is not there is left alone
-END_S = 1.0  # how long an image that is awaited may hold up the node's end
+CHECK_S = 0.05  # from one look for a subscriber to the next
+RETRY_S = 1.0  # until a camera that was not there is tried again
+END_S = 1.0  # for which an image that is awaited may delay the node's end
 
 
 class CameraDriver(GuardedNode):
     """``camera/image_raw`` and, with the same stamp, ``camera/camera_info`` of each image.
 
     Its parameters are those of `CameraDriverSettings`. A camera is asked for the size in its
-    calibration; a stamp is by ``latency`` earlier than the image came.
-
-    A file begins when somebody subscribes.
+    calibration; a stamp is ``latency`` before the image's arrival. A file begins when somebody
+    subscribes.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -57,7 +56,7 @@ class CameraDriver(GuardedNode):
                 "us-sim calibrate camera and name it with the parameter camera_info"
             )
         self.health.state = "opening"
-        self._take = self.create_newest_handler(self._publish, "camera")
+        self._hand_on = self.create_newest_handler(self._publish, "camera")
         self._ended = False
         self._closing = threading.Event()
         if self._video.is_file and not self._video.open():
@@ -66,7 +65,7 @@ class CameraDriver(GuardedNode):
         self._thread.start()
 
     def destroy_node(self) -> None:
-        """Let go of the camera."""
+        """Close the camera."""
         self._closing.set()
         self._thread.join(END_S)
         if not self._thread.is_alive():  # a camera that hangs is left to the process's end
@@ -93,7 +92,7 @@ class CameraDriver(GuardedNode):
                 while not self._closing.is_set():
                     age = self._video.grab_image()
                     now = self.get_clock().now().nanoseconds
-                    if age is None or not self._keep_newest(now - round(1e9 * age)):
+                    if age is None or not self._decode_image(now - round(1e9 * age)):
                         break
             self._video.close()
             if not self._closing.is_set():
@@ -105,7 +104,7 @@ class CameraDriver(GuardedNode):
                 self._closing.wait(RETRY_S)
 
     def _play(self) -> None:
-        """A file, as fast as it was recorded."""
+        """Play a file as fast as it was recorded."""
         self.health.state = "waiting for a subscriber"
         while not self._images.get_subscription_count():
             if self._closing.wait(CHECK_S):
@@ -118,7 +117,7 @@ class CameraDriver(GuardedNode):
             if self._closing.wait(max(due - now, 0) * 1e-9):
                 return
             # It was exposed when it was due, however long it takes to decode.
-            if self._video.grab_image() is None or not (shown := self._keep_newest(due)):
+            if self._video.grab_image() is None or not (shown := self._decode_image(due)):
                 # A file that holds nothing at all would be begun again without end.
                 if not (self._loop and number and shown and self._video.open()):
                     break
@@ -128,17 +127,13 @@ class CameraDriver(GuardedNode):
         self._ended = True
         self.call_soon(self._end)
 
-    def _keep_newest(self, taken: int) -> bool:
-        """Decode the newest image, for the node's thread to publish.
-
-        Args:
-            taken: ns, when it came from the camera.
-        """
-        stamp = taken - self._latency
+    def _decode_image(self, arrived: int) -> bool:
+        """Decode the image that arrived at ns, for the node's thread; return False if it fails."""
+        stamp = arrived - self._latency
         pixels = self._video.retrieve_image(grey=self._encoding == "mono8")
         if pixels is None:
             return False
-        self._take((stamp, pixels))
+        self._hand_on((stamp, pixels))
         return True
 
     # In the node's thread.
@@ -152,9 +147,9 @@ class CameraDriver(GuardedNode):
         self.get_logger().info("the video is at its end")
         self.finished.set_result(None)
 
-    def _publish(self, taken: tuple[int, NDArray[np.uint8]]) -> None:
+    def _publish(self, image: tuple[int, NDArray[np.uint8]]) -> None:
         self.health.state, self.health.fault = "publishing", ""
-        stamp, pixels = stamp_message(taken[0]), taken[1]
+        stamp, pixels = stamp_message(image[0]), image[1]
         rows, columns = pixels.shape[:2]
         camera = self._camera
         if camera is not None and (columns, rows) != (camera.width, camera.height):

@@ -1,4 +1,4 @@
-"""A node that goes on whatever comes in, refuses bad input, and reports its health."""
+"""A node that goes on after bad input and failures, and reports its health."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ CLOCK_S = 5.0  # for simulated time to begin, before it is said that it does not
 FAILED = "it failed; see the node's log"
 LONGEST = 500  # characters of a sentence: an error may quote all of a message
 REPEAT_S, SAY_AT_LEAST_S = 5.0, 300.0
-"""How long a problem is not said again at first, twice as long each time, and at most."""
+"""Time until a problem is logged again: at first, then twice as long each time, and at most."""
 
 
 class GuardedNode(Node):
     """A node whose callbacks are guarded: an exception ends neither this node nor others.
 
-    Bad input, an error of this package, is *refused*: said, and counted by its kind. Any other
-    exception is a *failure*: said, counted by where it happened, its traceback at log level debug.
-    `Health` puts both in diagnostics.
+    Bad input, an error of this package, is *refused*: logged, and counted by its kind. Any other
+    exception is a *failure*: logged, and counted by the callback that raised it. `Health` puts both
+    in diagnostics.
     """
 
     lockstep = False  # every message is worked on, in order
@@ -47,8 +47,7 @@ class GuardedNode(Node):
     def __init__(self, name: str, **kwargs: Any) -> None:
         self.failures: Counter[str] = Counter()
         self.last_failure = ""
-        self.arrived = time.monotonic_ns()
-        """When what is being worked on came, ns of the monotonic clock."""
+        self.arrived = time.monotonic_ns()  # of what is being worked on, by the monotonic clock
         self._due: dict[str, tuple[float, float]] = {}  # s: when to say it again, and then when
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         try:
@@ -61,12 +60,12 @@ class GuardedNode(Node):
 
     @property
     def is_time_simulated(self) -> bool:
-        """Whether the node's time is that of ``/clock``."""
+        """True if the node's time is that of ``/clock``."""
         clock = self.get_clock()
         return isinstance(clock, ROSClock) and clock.ros_time_is_active
 
     def _check_clock(self) -> None:
-        """Say that simulated time does not begin."""
+        """Warn if simulated time has not begun."""
         self._clockless.cancel()
         if not self.get_clock().now().nanoseconds:
             self.get_logger().warning(
@@ -87,16 +86,16 @@ class GuardedNode(Node):
         """Call ``callback``, guarded, with the messages of ``topic``.
 
         An executor takes one message of a subscription per turn, so a slow callback would fall
-        behind a fast publisher. With ``newest`` all that waits is taken at once, and what is not
-        the last of it is counted as dropped. In lockstep the callback gets every message.
+        behind a fast publisher. With ``newest`` the callback gets the last of all that wait, and
+        the others are counted as dropped. In lockstep it gets every message.
 
         Args:
             message_type: of rclpy.
             topic: its quality of service may be overridden by parameters.
-            callback: what it raises is said and counted under the topic's name.
+            callback: what it raises is logged and counted under the topic's name.
             qos: in lockstep, but for latched topics, it is `EVERY`.
-            newest: whether older messages are skipped.
-            raw: whether the callback gets serialized messages.
+            newest: skip older messages.
+            raw: give the callback serialized messages.
         """
         is_latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
         if self.lockstep and not is_latched:
@@ -120,7 +119,7 @@ class GuardedNode(Node):
         return subscription
 
     def handle_error(self, where: str, error: Exception) -> None:
-        """Refuse what came in, or count a failure; raise the error on while the node is ended."""
+        """Report bad input or a failure; raise the error again while the node is being ended."""
         if isinstance(error, ExternalShutdownException) or not self.context.ok():
             raise error
         if isinstance(error, UsSimError):
@@ -129,11 +128,11 @@ class GuardedNode(Node):
             self.report_failure(where, error)
 
     def report_bad_input(self, where: str, error: UsSimError) -> None:
-        """Count and say that something which came in cannot be used."""
+        """Count and log input that cannot be used."""
         self.health.count_problem(error_kind(error), f"{where}: {error}; it is not used")
 
     def report_failure(self, where: str, error: Exception) -> None:
-        """Count and say an exception that nobody expected; any thread may."""
+        """Count and log an unexpected exception; any thread may call this."""
         self.failures[where] += 1
         self.last_failure = loggable_text(f"{where}: {type(error).__name__}: {error}")
         if self.is_log_due(where):
@@ -144,7 +143,7 @@ class GuardedNode(Node):
             self.get_logger().debug("".join(traceback.format_exception(error)))
 
     def is_log_due(self, kind: str) -> bool:
-        """Return whether to log a problem of this kind: one that goes on ever more rarely."""
+        """Return whether to log a problem of this kind now; one that goes on is logged rarely."""
         now = time.monotonic()
         due, wait = self._due.get(kind, (now, REPEAT_S))
         if now < due:
@@ -153,11 +152,11 @@ class GuardedNode(Node):
         return True
 
     def guard_callback(self, where: str, callback: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the callback, which raises no more, unless the node is being ended.
+        """Return the callback guarded: it returns None in place of raising an exception.
 
         Args:
-            where: the service, or what else a person knows it by.
-            callback: takes what it takes; None is returned when it raises.
+            where: name of the service, timer, ... in reports.
+            callback: may raise only while the node is being ended.
         """
 
         @functools.wraps(callback)  # rclpy looks at its arguments
@@ -184,15 +183,15 @@ class GuardedNode(Node):
         return self.create_stream_publisher(message_type, topic, LATCHED)
 
     def create_timer(self, timer_period_sec: float, callback: Any, *args: Any, **kw: Any) -> Any:
-        """As `rclpy.node.Node.create_timer`, guarded, and by real time unless a clock is given.
+        """Create a guarded timer, by real time unless a clock is given.
 
-        Reports and whatever else serves the node itself go on while simulated time stands.
+        So reports go on while simulated time stands.
         """
         call = self.guard_callback(f"timer {_name(callback)}", callback)
         return super().create_timer(timer_period_sec, call, *args, **{"clock": self._steady, **kw})
 
     def call_soon(self, callback: Callable[[], Any], where: str = "") -> None:
-        """Have the executor call ``callback``, guarded; any thread may ask for that."""
+        """Have the executor call ``callback``, guarded; any thread may call this."""
         if self.executor is not None:  # else it has ended, or has not begun
             self.executor.create_task(self.guard_callback(where or _name(callback), callback))
 
@@ -200,8 +199,8 @@ class GuardedNode(Node):
         """Return a function by which a device's thread hands its newest value to the node's.
 
         Args:
-            use: called with the value in the node's thread; one that is overtaken is dropped.
-            where: what a person knows the thread by.
+            use: called with the value in the node's thread; older values are dropped.
+            where: name of the thread in reports.
         """
         newest: deque[T] = deque(maxlen=1)
 
@@ -218,11 +217,11 @@ class GuardedNode(Node):
         return put
 
     def create_command(self, name: str, act: Callable[[], str]) -> None:
-        """Offer a momentary command, which has no parameter, as the service ``~/name``.
+        """Offer a command without parameters as the service ``~/name`` of type std_srvs/Trigger.
 
         Args:
-            name: below the node's own, of the type std_srvs/Trigger.
-            act: does it; returns why that cannot be, or nothing.
+            name: below the node's own.
+            act: does it; returns a sentence on why it cannot be done, or nothing.
         """
 
         def answer(_: Any, response: Any) -> Any:
@@ -237,9 +236,8 @@ class GuardedNode(Node):
 class NewestQueue:
     """The queue of a subscription whose newest message alone is worked on.
 
-    Messages that a full queue has overwritten are counted by the numbers that a publisher gives.
-    rclpy's EventsExecutor does not tell a callback its message's number, but one that is taken
-    from the queue has it, and a queue that was full has several.
+    Messages that a full queue has overwritten are counted by the publisher's numbers. rclpy's
+    EventsExecutor does not hand these to a callback, but messages taken from the queue have them.
     """
 
     def __init__(self, node: GuardedNode) -> None:
@@ -248,7 +246,7 @@ class NewestQueue:
         self._last: tuple[int, int] | None = None  # a number, and how many were taken by then
 
     def drain_to_newest(self, subscription: Subscription, message: Any) -> Any:
-        """Take all that waits behind ``message``, and return the last; count what is skipped."""
+        """Take all messages that wait behind ``message``; return the last, count the others."""
         self._taken += 1
         health = self._node.health
         newest: tuple[Any, dict[str, Any]] = message, {}
@@ -265,40 +263,38 @@ class NewestQueue:
         number = info.get("publication_sequence_number")  # not every middleware has it
         if number is not None:
             before, self._last = self._last, (number, self._taken)
-            if before and number > before[0] and self._has_one_publisher(subscription):
+            is_alone = self._node.count_publishers(subscription.topic_name) == 1
+            if before and number > before[0] and is_alone:
                 health.dropped += max(number - before[0] - (self._taken - before[1]), 0)
         return message
 
-    def _has_one_publisher(self, subscription: Subscription) -> bool:
-        return bool(self._node.count_publishers(subscription.topic_name) == 1)
-
 
 class Subscriptions:
-    """Subscriptions that are there or not, all together.
+    """Subscriptions that exist all together, or not at all.
 
     Args:
         node: that subscribes.
-        wanted: type, topic, callback, quality of service, and whether bytes are handed over.
+        wanted: type, topic, callback and quality of service; True for serialized messages.
     """
 
     def __init__(self, node: GuardedNode, *wanted: tuple[Any, str, Any, QoSProfile, bool]) -> None:
         self._node, self._wanted = node, wanted
-        self._there: list[Any] = []
+        self._active: list[Any] = []
 
     def set_active(self, is_wanted: bool) -> bool:
-        """Subscribe, or no longer; whether that is a change."""
-        if is_wanted == bool(self._there):
+        """Subscribe, or end the subscriptions; return whether that is a change."""
+        if is_wanted == bool(self._active):
             return False
-        for subscription in self._there:
+        for subscription in self._active:
             self._node.destroy_subscription(subscription)
-        self._there = []
+        self._active = []
         for kind, topic, callback, qos, raw in self._wanted if is_wanted else ():
-            self._there.append(self._node.subscribe(kind, topic, callback, qos, raw=raw))
+            self._active.append(self._node.subscribe(kind, topic, callback, qos, raw=raw))
         return True
 
 
 def error_kind(error: UsSimError) -> str:
-    """Return the kind that an error is counted as: ``pose`` of a PoseError."""
+    """Return the kind by which an error is counted: ``pose`` for a PoseError."""
     return type(error).__name__.removesuffix("Error").lower()
 
 
@@ -307,24 +303,22 @@ def _name(callback: Any) -> str:
 
 
 def loggable_text(sentence: str) -> str:
-    """Return the sentence as it may be logged: it may quote a message."""
+    """Return a sentence, which may quote a message, on one line of limited length."""
     return printable_line(" ".join(sentence[: LONGEST + 1].split()), LONGEST)
 
 
-ANOTHER_CLOCK_S = 10.0
-"""From the present to a stamp: from there on it is of another clock, or of an earlier day."""
+ANOTHER_CLOCK_S = 10.0  # between the present and a stamp, from which on it is of another clock
 
 
 class Health:
     """Counts of a node's work, published on ``diagnostics`` at 1 Hz.
 
-    Its level is ERROR while a fault keeps the node from its work and after an exception that nobody
-    expected, WARN while something is wrong and after bad input, and else OK.
+    Its level is ERROR during a fault that keeps the node from its work and after a failure, WARN
+    while something else is wrong and after bad input, and otherwise OK.
 
-    Latency is the age of what goes out by its stamp. It counts from the arrival of what a message
-    was made from under simulated time, which goes in steps, and where stamps are of another clock,
-    as those of a recording are; the latter is said once. An age below zero is a clock that is
-    wrong, on this computer or another one.
+    Latency is the age of a published message by its stamp. Under simulated time, and if stamps are
+    of another clock, as those of a recording, it counts from the arrival of the message that it was
+    made from. An age below zero is a clock that is wrong, on this computer or another one.
 
     Args:
         node: whose clock, logger and timer are used.
@@ -338,8 +332,8 @@ class Health:
         self._published: Counter[str] = Counter()
         self._problems: Counter[str] = Counter()
         self._last_problem = self._last_kind = ""
-        self.warning = ""  # what is wrong for as long as it is
-        self.fault = ""  # likewise, where it keeps the node from its work
+        self.warning = ""  # what is wrong at present
+        self.fault = ""  # the same, if it keeps the node from its work
         self._failures_told = 0
         self._clock_differs = False
         self._last_total, self._last_time = 0, time.monotonic()
@@ -347,15 +341,15 @@ class Health:
         self.received = self.dropped = 0  # messages
         self.values: dict[str, str] = {}
         self.measure: Callable[[], dict[str, str]] = dict  # values found for each report
-        self.preparing = ""  # what it goes on without until that is ready
-        self.scheduling = ""  # how its process goes before others, if that was asked for
+        self.preparing = ""  # what is not ready yet
+        self.scheduling = ""  # of its process, `realtime` or `ordinary`, if it asked for the former
         if hardware_id is not None:
             self._publisher = node.create_stream_publisher(DiagnosticArray, "diagnostics")
             node.create_timer(1.0, self.publish_report)
             self._first = node.create_timer(0.01, self._report_first)
 
     def count_published(self, topic: str, stamp: TimeMessage | None = None) -> None:
-        """Count a message that went out on ``topic``; with a stamp, its age is a latency."""
+        """Count a message published on ``topic``; with a stamp, its age is a latency."""
         self._published[topic] += 1
         if stamp is not None:
             self._latencies.append(1e3 * self._age(nanoseconds_of(stamp)))
@@ -374,14 +368,14 @@ class Health:
         return 1e-9 * (time.monotonic_ns() - self._node.arrived)
 
     def count_problem(self, kind: str, sentence: str) -> None:
-        """Count a problem of that kind; one that goes on is logged ever more rarely."""
+        """Count and log a problem; one that goes on is logged ever more rarely."""
         self._problems[kind] += 1
         self._last_problem, self._last_kind = loggable_text(sentence), kind
         if self._node.is_log_due(kind):
             self._node.get_logger().warning(self._last_problem)
 
     def problem_count(self, kind: str) -> int:
-        """Return how many of that kind there were."""
+        """Return the number of problems of a kind."""
         return self._problems[kind]
 
     def _report_first(self) -> None:
@@ -389,7 +383,7 @@ class Health:
         self.publish_report()
 
     def publish_report(self) -> None:
-        """Publish the report: once a second, and at once when it is urgent."""
+        """Publish the report: a timer does so once a second, others at once if it is urgent."""
         node, now = self._node, time.monotonic()
         total = max(self._published.values(), default=0)
         rate = (total - self._last_total) / max(now - self._last_time, 1e-9)

@@ -1,4 +1,4 @@
-"""Gives a haptic arm the force on the probe between two solutions of the tissue."""
+"""Rendering of the force on the probe on a haptic arm, between two solutions of the tissue."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from us_sim.nodes.scene_node import SceneNode
 from us_sim.recording.decoding import nanoseconds_of, pose_from
 from us_sim.scene.building import build_haptic_rendering, source_settings
 
-_MEASURED = 2000  # ticks of which the jitter is told
+_MEASURED = 2000  # ticks, of which the jitter is measured
 
 
 class PeriodicThread:
-    """Calls ``work`` at absolute times one period apart, from now on; skips those that have passed.
+    """Calls ``work`` at absolute times one period apart; skips times that have passed.
 
     Args:
         rate: Hz.
-        work: what to do, with the time in ns of the monotonic clock; it must not raise.
+        work: called with the time in ns of the monotonic clock; it must not raise.
     """
 
     def __init__(self, rate: float, work: Callable[[int], None]) -> None:
@@ -48,8 +48,7 @@ class PeriodicThread:
 
     @property
     def jitter(self) -> float:
-        """s, by which 99 of 100 of the last ticks' work was done later than the period after the
-        one before, or earlier, at most."""
+        """99th percentile, s, of the deviation from one period between the last ticks."""
         late = np.array(self._late)
         return 1e-9 * float(np.percentile(np.abs(np.diff(late)), 99)) if len(late) > 1 else 0.0
 
@@ -68,15 +67,15 @@ class PeriodicThread:
             self._late.append(time.monotonic_ns() - due)
 
 
-CHECKS = 5.0  # times a second that it is seen who listens
+CHECKS = 5.0  # a second, of who listens
 
 
 class HapticRenderer(SceneNode):
     """``haptic/pose``, ``haptic/clutch`` and ``tissue/contact_model`` in; ``haptic/wrench`` out.
 
-    The wrench on the handle goes out at ``tracker.haptic.rate``, about the handle's origin along
-    the axes of the pose's frame, with the newest pose's stamp. It is zero at any doubt, which the
-    state tells, and grows slowly after it, as it does for whoever subscribes first.
+    The wrench on the handle is published at ``tracker.haptic.rate``, about the handle's origin in
+    the axes of the pose's frame, with the newest pose's stamp. It is zero at any doubt, which
+    diagnostics explain, and grows slowly afterwards and for the first subscriber.
     """
 
     live_priority = 20  # its thread goes before other nodes; interrupts' are at 50
@@ -88,7 +87,7 @@ class HapticRenderer(SceneNode):
         settings = source_settings(self.scene, "haptic")
         self._rendering = build_haptic_rendering(self.scene)
         self._frame = self.scene.tracker.frame
-        self._is_taken = False
+        self._has_subscriber = False
         self._stops = 0
         self._wrenches = self.create_stream_publisher(WrenchStamped, "haptic/wrench")
         self.subscribe(PoseStamped, "haptic/pose", self._on_pose, FOREIGN)
@@ -100,7 +99,7 @@ class HapticRenderer(SceneNode):
         self._thread = PeriodicThread(settings.rate, self.guard_callback("rendering", self._render))
 
     def destroy_node(self) -> None:
-        """End with a zero wrench."""
+        """Stop the thread and publish a zero wrench."""
         self._thread.stop()
         self._publish(np.zeros(6))
         super().destroy_node()
@@ -115,25 +114,25 @@ class HapticRenderer(SceneNode):
         self._rendering.update_model(contact_model_from(message), time.monotonic_ns())
 
     def report_bad_input(self, where: str, error: UsSimError) -> None:
-        """Feel nothing, too, where something that came cannot be used."""
+        """Count and log input that cannot be used, and stop rendering."""
         super().report_bad_input(where, error)
         self._rendering.stop_rendering(f"{where}: {error}")
 
     def report_failure(self, where: str, error: Exception) -> None:
-        """Send a zero wrench, and begin anew, since the failed state may be corrupt."""
+        """Count and log a failure, and begin anew, since the failed state may be corrupt."""
         super().report_failure(where, error)
         self._rendering = build_haptic_rendering(self.scene)
         self._stops = 0
 
     def _render(self, now: int) -> None:
         rendering = self._rendering
-        if not self._is_taken:
+        if not self._has_subscriber:
             rendering.stop_rendering("nobody takes the wrench")
         wrench = np.zeros(6)
         try:
             wrench = rendering.render(now)
-        finally:  # also should it fail: the arm must not keep what it was told last
-            if self._is_taken:
+        finally:  # also if it fails: the arm must not keep its last wrench
+            if self._has_subscriber:
                 self._publish(wrench)
 
     def _publish(self, wrench: NDArray[np.float64]) -> None:
@@ -149,7 +148,7 @@ class HapticRenderer(SceneNode):
         self.health.count_published("haptic/wrench")
 
     def _check_model_age(self) -> None:
-        self._is_taken = self._wrenches.get_subscription_count() > 0
+        self._has_subscriber = self._wrenches.get_subscription_count() > 0
         doubt, stops = self._rendering.doubt, self._rendering.stops
         if stops > self._stops:
             self.health.count_problem("doubt", f"nothing is felt: {self._rendering.stopped}")

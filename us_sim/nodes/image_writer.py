@@ -1,4 +1,4 @@
-"""Writes the images of a session as numbered files, and labels and displacements if asked for."""
+"""Writing a session's images, labels and displacements as numbered files."""
 
 from __future__ import annotations
 
@@ -19,15 +19,14 @@ from us_sim.nodes.qos import EVERY
 from us_sim.nodes.settings import ImageWriterSettings
 from us_sim.recording.decoding import field_from, nanoseconds_of, pixels_from
 
-REMEMBERED = 1000  # images whose numbers are kept for what is known of them
+REMEMBERED = 1000  # images whose numbers are kept for their labels and displacements
 
 
 class ImageWriter(GuardedNode):
-    """``ultrasound/image`` to ``folder/000000.png``, ``000001.png``, …
+    """Writes ``ultrasound/image`` to ``folder/000000.png``, ``000001.png`` and so on.
 
-    Where the parameters give folders for them, ``ultrasound/labels`` and
-    ``ultrasound/displacement`` go to files, ``.png`` and ``.npy``, of the number that the image of
-    the same stamp has or will have.
+    If the parameters give folders for them, it also writes ``ultrasound/labels`` (``.png``) and
+    ``ultrasound/displacement`` (``.npy``), with the number of the image of the same stamp.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -57,7 +56,7 @@ class ImageWriter(GuardedNode):
         self.counts[topic] += 1
 
     def _number(self, stamp: int) -> int:
-        """Return the number of a stamp: the next of all, where nothing of it has come yet."""
+        """Return the number of a stamp: the next number if nothing with it has come yet."""
         if stamp not in self._numbers:
             self._numbers[stamp] = self._next
             self._next += 1

@@ -1,7 +1,6 @@
 """Messages from values of the domain; `us_sim.recording.decoding` is the way back.
 
-Bulk data are handed over as ``array.array('B', …)``, which rclpy takes without looking at each
-element.
+rclpy takes bulk data in ``array.array`` without a look at each element.
 """
 
 from __future__ import annotations
@@ -29,17 +28,17 @@ CDR_LITTLE_ENDIAN = b"\0\1\0\0"  # what serialized messages begin with
 
 
 def pack_array(code: str, values: NDArray[Any]) -> array[Any]:
-    """All values in order, copied once (``array(code, bytes)`` takes forty times as long)."""
+    """Copy all values in order, once (``array(code, bytes)`` takes forty times as long)."""
     data = array(code)
     data.frombytes(np.ascontiguousarray(values).ravel().view(np.uint8).data)
     return data
 
 
 def stamp_message(nanoseconds: int) -> Time:
-    """The stamp of a time in ns since 1970; of 1970 itself where it is before.
+    """Make the stamp of a time in ns since 1970, at least 0.
 
     Raises:
-        StampError: it is so late that ROS cannot count any further.
+        StampError: the time is too late for a stamp.
     """
     seconds, rest = divmod(max(int(nanoseconds), 0), SECOND)
     if seconds > LAST_SECOND:
@@ -48,7 +47,7 @@ def stamp_message(nanoseconds: int) -> Time:
 
 
 def pose_message(pose: Pose, stamp: Time, frame: str) -> PoseStamped:
-    """``pose`` of the probe in ``frame``."""
+    """Make the message of a pose in ``frame``."""
     message = PoseStamped(header=Header(stamp=stamp, frame_id=frame))
     p, q = message.pose.position, message.pose.orientation
     p.x, p.y, p.z = map(float, pose.position)
@@ -57,12 +56,12 @@ def pose_message(pose: Pose, stamp: Time, frame: str) -> PoseStamped:
 
 
 def pose_text(pose: Pose) -> str:
-    """Position (m) and quaternion x, y, z, w, as a value of diagnostics."""
+    """Write position (m) and quaternion x, y, z, w as a value of diagnostics."""
     return " ".join(repr(float(number)) for number in (*pose.position, *pose.orientation))
 
 
 def transform_message(pose: Pose, stamp: Time, frame: str, child: str) -> TransformStamped:
-    """The same transform for tf."""
+    """Make the message for tf of a pose of ``child`` in ``frame``."""
     message = TransformStamped(header=Header(stamp=stamp, frame_id=frame))
     message.child_frame_id = child
     t, q = message.transform.translation, message.transform.rotation
@@ -74,7 +73,7 @@ def transform_message(pose: Pose, stamp: Time, frame: str, child: str) -> Transf
 def wrench_message(
     force: NDArray[np.float64], torque: NDArray[np.float64], stamp: Time, frame: str
 ) -> WrenchStamped:
-    """Force (3,) N and torque (3,) N m about the origin of ``frame``."""
+    """Make the message of a force (3,) N and torque (3,) N m about the origin of ``frame``."""
     message = WrenchStamped(header=Header(stamp=stamp, frame_id=frame))
     f, t = message.wrench.force, message.wrench.torque
     f.x, f.y, f.z = map(float, force)
@@ -83,20 +82,17 @@ def wrench_message(
 
 
 def serialize_wrench(wrench: NDArray[np.float64], stamp: int, frame: str) -> bytes:
-    """Force and torque (6,) N, N m about the origin of ``frame`` at ns, as a WrenchStamped.
-
-    Written here it takes a tenth of the time, for those who send a thousand a second.
-    """
+    """Serialize a WrenchStamped of force and torque (6,) N, N m at ns; ten times rclpy's speed."""
     name = frame.encode() + b"\0"
     head = struct.pack(f"@iII{len(name)}s0d", *divmod(stamp, 1_000_000_000), len(name), name)
     return CDR_LITTLE_ENDIAN + head + wrench.astype("<f8").tobytes()
 
 
-_LARGEST_OF_CONTACT = 1e10  # N, N/m or s: products of larger ones would end in a hand as infinite
+_LARGEST_OF_CONTACT = 1e10  # N, N/m or s: products of larger ones may become infinite
 
 
 def contact_model_message(model: ContactModel) -> Float64MultiArray:
-    """Make one of 51 numbers, in SI units.
+    """Make the message of 51 numbers, in SI units.
 
     Seconds and nanoseconds; position and quaternion of the probe; force and torque; the six rows
     of the stiffness.
@@ -107,12 +103,7 @@ def contact_model_message(model: ContactModel) -> Float64MultiArray:
 
 
 def contact_model_from(message: Float64MultiArray) -> ContactModel:
-    """Return the model of the contact in a message.
-
-    Raises:
-        TrackingError: it has other parts, or a number that cannot be.
-        StampError: its stamp is no time.
-    """
+    """Return the contact model of a message; refuse other counts, sizes or times."""
     values = np.array(message.data, dtype=np.float64)
     if len(values) != 51 or not (np.abs(values) <= _LARGEST_OF_CONTACT).all():
         raise TrackingError(
@@ -127,7 +118,7 @@ def contact_model_from(message: Float64MultiArray) -> ContactModel:
 
 
 def cloud_message(columns: dict[str, NDArray[np.floating]], stamp: Time, frame: str) -> PointCloud2:
-    """A float32 cloud whose fields are the ``columns``, each (N,), in their order."""
+    """Make a float32 cloud whose fields are the ``columns``, each (N,), in their order."""
     table = np.column_stack(list(columns.values())).astype("<f4")
     message = PointCloud2(header=Header(stamp=stamp, frame_id=frame))
     message.height, message.width = 1, len(table)
@@ -143,19 +134,12 @@ def cloud_message(columns: dict[str, NDArray[np.floating]], stamp: Time, frame: 
 
 
 def tetrahedra_message(tetrahedra: NDArray[np.integer]) -> Int32MultiArray:
-    """(M, 4) node indices."""
-    message = Int32MultiArray()
-    count = len(tetrahedra)
-    message.layout.dim = [
-        MultiArrayDimension(label="tetrahedron", size=count, stride=4 * count),
-        MultiArrayDimension(label="node", size=4, stride=4),
-    ]
-    message.data = pack_array("i", tetrahedra.astype(np.int32))
-    return message
+    """Make the message of the node indices (M, 4)."""
+    return _table_message(Int32MultiArray(), "i", tetrahedra.astype(np.int32), "tetrahedron node")
 
 
 def mesh_message(vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> Mesh:
-    """(N, 3) m and (T, 3) as a shape."""
+    """Make a mesh of vertices (N, 3) m and triangles (T, 3)."""
     return Mesh(
         vertices=[Point(x=x, y=y, z=z) for x, y, z in vertices.tolist()],
         triangles=[MeshTriangle(vertex_indices=triple.astype(np.uint32)) for triple in triangles],
@@ -167,11 +151,8 @@ def image_message(
 ) -> Image:
     """Make an image of (rows, columns) or (rows, columns, channels) pixels.
 
-    Args:
-        pixels: by default bytes are grey values (``mono8``), or red, green and blue (``rgb8``);
-            float32 are values of as many channels (``32FC…``), where NaN is none there.
-        stamp, frame: of its header.
-        encoding: another one, such as ``bgr8``.
+    By default bytes are grey values (``mono8``), or red, green and blue (``rgb8``), and float32 are
+    values of as many channels (``32FC…``), where NaN is no value.
     """
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     if encoding is None:
@@ -186,18 +167,23 @@ def image_message(
 
 
 def affine_message(matrix: NDArray[np.floating]) -> Float64MultiArray:
-    """A (4, 4) affine map, row after row."""
-    message = Float64MultiArray()
+    """Make the message of a (4, 4) affine map, row after row."""
+    return _table_message(Float64MultiArray(), "d", matrix.astype(np.float64), "row column")
+
+
+def _table_message(message: Any, code: str, table: NDArray[Any], labels: str) -> Any:
+    """Fill a multi-array message with a table (N, 4), whose two dimensions have these labels."""
+    rows, columns = labels.split()
     message.layout.dim = [
-        MultiArrayDimension(label="row", size=4, stride=16),
-        MultiArrayDimension(label="column", size=4, stride=4),
+        MultiArrayDimension(label=rows, size=len(table), stride=table.size),
+        MultiArrayDimension(label=columns, size=4, stride=4),
     ]
-    message.data = pack_array("d", matrix.astype(np.float64))
+    message.data = pack_array(code, table)
     return message
 
 
 class MarkerShape(NamedTuple):
-    """Triangles or a line, as a marker shows them."""
+    """Triangles or a line of a marker."""
 
     namespace: str
     colour: tuple[float, float, float, float]  # red, green, blue, alpha
@@ -214,12 +200,12 @@ _MARKER_TAIL = struct.pack(
 
 
 def serialize_marker(shape: MarkerShape, stamp: Time, frame: str) -> bytes:
-    """Make the serialized Marker of a shape."""
+    """Serialize a Marker of a shape."""
     return b"".join([CDR_LITTLE_ENDIAN, *_serialized(shape, stamp, frame, 0)])
 
 
 def serialize_markers(shapes: Sequence[MarkerShape], stamp: Time, frame: str) -> bytes:
-    """Make the serialized MarkerArray of shapes, each in its own namespace."""
+    """Serialize a MarkerArray of shapes, each in its own namespace."""
     parts = [CDR_LITTLE_ENDIAN, struct.pack("@I", len(shapes))]
     for shape in shapes:
         parts += _serialized(shape, stamp, frame, sum(map(len, parts[1:])))
@@ -227,10 +213,10 @@ def serialize_markers(shapes: Sequence[MarkerShape], stamp: Time, frame: str) ->
 
 
 def _serialized(shape: MarkerShape, stamp: Time, frame: str, offset: int) -> list[bytes]:
-    """Make the parts of a serialized marker that begins at that offset of a message.
+    """Serialize a marker that begins at an offset of a message; return its parts.
 
-    It holds an object for each point, too slow to make one by one. So the CDR is written here:
-    native alignment in `struct` is CDR's, and ``0d`` aligns what follows.
+    rclpy would make an object for each point, which is too slow. Native alignment in `struct` is
+    that of CDR, and ``0d`` aligns what follows.
     """
     name, place = shape.namespace.encode() + b"\0", frame.encode() + b"\0"
     kind = Marker.LINE_STRIP if shape.line_width else Marker.TRIANGLE_LIST

@@ -1,4 +1,4 @@
-"""Shows 3D Slicer, or whatever else speaks OpenIGTLink, the image and the probe as they move."""
+"""A bridge that sends image and probe to 3D Slicer, or to other clients of OpenIGTLink."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ CLIENTS_S = 0.5  # between two counts of the connected clients
 class OpenIGTLinkBridge(SceneNode):
     """``probe/pose`` and ``ultrasound/image`` in; an OpenIGTLink server out.
 
-    It sends the image ``Image_Reference``, which lies in the reference by itself, and the
-    transforms ``ImageToReference`` and ``ProbeToReference``. Its own parameters are those of
-    `OpenIGTLinkBridgeSettings`; with the volume's own frame as the reference, the volume's file
-    loaded in Slicer fits.
+    It sends the image ``Image_Reference``, placed in the reference frame, and the transforms
+    ``ImageToReference`` and ``ProbeToReference``. Its own parameters are those of
+    `OpenIGTLinkBridgeSettings`. If the reference is the volume's own frame, the images fit the
+    volume's file in Slicer.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -55,11 +55,11 @@ class OpenIGTLinkBridge(SceneNode):
 
     @property
     def port(self) -> int:
-        """Where the server listens."""
+        """Port at which the server listens."""
         return self._server.port
 
     def destroy_node(self) -> None:
-        """Disconnect all."""
+        """Disconnect all clients."""
         self._server.close()
         super().destroy_node()
 

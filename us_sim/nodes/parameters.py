@@ -33,11 +33,10 @@ def declare_settings(
         node: that gets the parameters.
         settings: the values by default.
         names: the settings that are parameters; None is all.
-        prefix: what goes before their names.
+        prefix: before their names.
 
     Raises:
-        SettingsError: or the settings' own error: a value will not do; the node's name and the
-            parameter's come first.
+        UsSimError: the settings' own: a value is refused; node and parameter are named.
     """
     cls = type(settings)
     chosen = [name for name in rules_of(cls) if names is None or name in names]
@@ -51,18 +50,14 @@ def declare_settings(
 class LiveSettings:
     """Settings of a node as parameters, some of which may change while it runs.
 
-    They have keys; one that ends with a dot goes before the names of its parameters.
+    Settings have keys; a key that ends with a dot is the prefix of its parameters' names.
 
     Args:
         node: that gets the parameters.
         settings: the values by default, by their keys.
-        check: called with all settings, by their keys, before a change is taken; what it raises
-            refuses it.
-        use: called likewise when parameters have been set.
-        names: of those settings that are parameters, by key, where not all are.
-
-    Raises:
-        SettingsError: or the settings' own error: a value given at the start will not do.
+        check: called with all settings, by their keys, before a change; its error refuses that.
+        use: called with them after a change.
+        names: the settings that are parameters, by key, where not all are.
     """
 
     def __init__(
@@ -78,7 +73,7 @@ class LiveSettings:
             key: declare_settings(node, given, (names or {}).get(key), _prefix(key))
             for key, given in settings.items()
         }
-        self._checked = self.values  # of the change that is about to be made
+        self._checked = self.values  # with the change that is about to be made
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._on_post_set)
 
@@ -94,7 +89,7 @@ class LiveSettings:
             self._node.set_parameters_atomically(back)  # one alone may not go with another
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Make the settings as they would be; what refuses that refuses the parameters."""
+        """Make the settings as they would be; refuse the parameters if that fails."""
         try:
             checked = {
                 key: settings_with(settings, parameters, _prefix(key))
@@ -122,16 +117,13 @@ def _prefix(key: str) -> str:
 def settings_with(
     settings: S, parameters: Sequence[Parameter], prefix: str = "", before: str = ""
 ) -> S:
-    """Make the settings with the values of parameters that are theirs.
+    """Return the settings with the values of those parameters that are theirs.
 
     Args:
         settings: as they are.
-        parameters: of which some may be others'.
-        prefix: before the names of theirs.
-        before: likewise, in the sentence of an error.
-
-    Raises:
-        SettingsError: or the settings' own error: a value will not do.
+        parameters: of these and of other settings.
+        prefix: of the parameters' names.
+        before: the name of a parameter in the sentence of an error.
     """
     values = {each.name: each.value for each in parameters}
     changes = {
@@ -149,7 +141,7 @@ def settings_with(
 
 
 def parameters_with(settings: Settings) -> list[Parameter]:
-    """List the parameters that settings are."""
+    """List settings as parameters."""
     return [Parameter(name, value=_raw(settings, name)) for name in rules_of(type(settings))]
 
 
@@ -158,25 +150,25 @@ def _raw(settings: Settings, name: str) -> Any:
 
 
 def _descriptor(settings: Settings, name: str) -> ParameterDescriptor:
-    """The description of a setting that `ros2 param describe` shows.
+    """Describe a setting for `ros2 param describe`.
 
-    What ROS has no field for is a JSON object in ``additional_constraints``: ``unit`` (SI),
-    ``shown_in`` (the unit on a dial), ``choices`` (their meanings by name, as far as told),
-    ``none`` (the value that stands for none), ``live`` (whether it may change while the node runs).
+    ``additional_constraints`` is a JSON object: ``unit`` (SI), ``shown_in`` (the unit on a dial),
+    ``choices`` (their meanings by name), ``none`` (the value that stands for none), ``live`` (true
+    if it may change while the node runs).
     """
     rule, kind = rules_of(type(settings))[name], kinds_of(type(settings))[name]
     live = is_live(type(settings), name)
-    told: dict[str, Any] = {"live": live}
+    more: dict[str, Any] = {"live": live}
     if rule.quantity and rule.quantity.unit:
-        told |= {"unit": rule.quantity.unit, "shown_in": choose_dial_unit(rule.quantity)}
+        more |= {"unit": rule.quantity.unit, "shown_in": choose_dial_unit(rule.quantity)}
     meanings = rule.choice.summaries if rule.choice else {}
     if names := rule.choice.names if rule.choice else rule.choices:
-        told["choices"] = {each: meanings.get(each, "") for each in names}
+        more["choices"] = {each: meanings.get(each, "") for each in names}
     if may_be_none(kind):
-        told["none"] = "" if str in get_args(kind) else 0
+        more["none"] = "" if str in get_args(kind) else 0
     descriptor = ParameterDescriptor(
         description=rule.description,
-        additional_constraints=json.dumps(told, ensure_ascii=False),
+        additional_constraints=json.dumps(more, ensure_ascii=False),
         read_only=not live,
         dynamic_typing=kind is str and not live,
     )

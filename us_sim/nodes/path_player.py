@@ -1,4 +1,4 @@
-"""Plays a recorded probe path as a tracker would."""
+"""A player of recorded probe paths, in place of a tracker."""
 
 from __future__ import annotations
 
@@ -23,18 +23,16 @@ from us_sim.settings.spelling import format_count
 HELD = 5.0
 """Poses a second of a probe that is held still; images are called stale after half a second."""
 CHECK_S, CHECKS = 0.05, 6
-"""How often it is looked, and how often in a row everything must be there before it begins.
-
-A best-effort subscriber may find a publisher a little later than it is found itself.
-"""
-TELL_AFTER_S = 5.0  # after so long it is said what is waited for
+"""Period of looks for the awaited topics, and looks in a row that must find all of them: a
+best-effort subscriber may find a publisher a little later than it is found itself."""
+TELL_AFTER_S = 5.0  # after which the awaited topic is logged
 
 
 class PathPlayer(RecordingPlayer):
     """A bag's poses on ``tracker/pose``, once the topics that its parameters name are there.
 
-    Its parameters are those of `PathPlayerSettings`. What is waited for is said after a while, and
-    told in diagnostics as ``awaited``.
+    Its parameters are those of `PathPlayerSettings`. What it waits for is logged after a while, and
+    ``awaited`` in diagnostics.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -71,15 +69,15 @@ class PathPlayer(RecordingPlayer):
 
     @property
     def _tick_s(self) -> float:
-        """s from pose to pose as they are played."""
+        """Time from pose to pose as they are played, s."""
         return float(max(1e-9 * self._step / self.settings.rate, 1e-4))
 
     def _begin(self) -> None:
-        """Begin once everything has been there for a while."""
+        """Begin once everything awaited has been there for a while."""
         missing = self._missing_topics()
         self._checks = 0 if missing else self._checks + 1
-        told = self.health.values.get("awaited", "")
-        if missing not in ("", told) and time.monotonic() - self._waiting_since > TELL_AFTER_S:
+        logged = self.health.values.get("awaited", "")
+        if missing not in ("", logged) and time.monotonic() - self._waiting_since > TELL_AFTER_S:
             self.health.values["awaited"] = missing
             self.get_logger().warning(f"nothing is played yet: waiting for {missing}")
         if self._checks < CHECKS or not self.now:
@@ -104,7 +102,7 @@ class PathPlayer(RecordingPlayer):
         self.play_on()
 
     def _missing_topics(self) -> str:
-        """Return what is awaited and not there; nothing when all is."""
+        """Return the first that is awaited and not there; nothing when all are."""
         if not self._poses.get_subscription_count():
             return f"somebody to subscribe to {self._poses.topic_name}"
         for topic in map(self.resolve_topic_name, self.settings.await_topics):
@@ -117,14 +115,14 @@ class PathPlayer(RecordingPlayer):
         return ""
 
     def describe_progress(self) -> dict[str, str]:
-        """Return how many poses were sent, also when the first was, and how far that is."""
+        """Return, for diagnostics, the poses that were sent and the time of the first, too."""
         return super().describe_progress() | {
             "played": str(self._next),
             "begun": f"{1e-9 * self.head.compute_start(self.now):.9f}",
         }
 
     def apply_settings(self) -> None:
-        """Go on at the rate and with the timer that was set; lockstep has neither."""
+        """Go on at the rate that was set; lockstep has none."""
         if self.settings.lockstep:
             return
         if self.has_begun and self.settings.rate != self.head.rate:
@@ -134,7 +132,7 @@ class PathPlayer(RecordingPlayer):
         super().apply_settings()
 
     def go_to(self, position: int, at: int | None = None) -> None:
-        """Play on there, and send at once the pose that is held there while it is paused."""
+        """Play on from a position; without a time ``at``, send the pose there at once."""
         self.head.go_to(position, self.now if at is None else at)
         self._next = min(int(np.searchsorted(self._ages, position)), self.pose_count - 1)
         if at is None:
@@ -152,10 +150,7 @@ class PathPlayer(RecordingPlayer):
         return self._is_over
 
     def hold_still(self) -> None:
-        """Say a few times a second that a probe which is held still is still there.
-
-        Nothing ages while the player holds the clock, too.
-        """
+        """Send the pose of a held probe a few times a second, unless the player has the clock."""
         if not self.settings.clock and time.monotonic() - self._sent_at > 1.0 / HELD:
             self._send(min(self._next, self.pose_count - 1))
 
@@ -186,11 +181,7 @@ class PathPlayer(RecordingPlayer):
 
 
 def _rising_stamps(path: ProbePath) -> NDArray[np.int64]:
-    """Stamps that tell the poses apart: their own, or else the times they were recorded at.
-
-    Raises:
-        BagError: neither rise from pose to pose.
-    """
+    """Return stamps that differ from pose to pose: their own, or else the times of recording."""
     for stamps in (path.stamps, path.log_times):
         if (np.diff(stamps) > 0).all():  # 0 and less would be no time
             return stamps if stamps[0] > 0 else stamps - stamps[0] + 10**9

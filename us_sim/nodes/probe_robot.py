@@ -1,4 +1,4 @@
-"""Holds the probe as a robot arm does: follows a wanted velocity, and seeks a wanted force."""
+"""A robot arm that holds the probe: it follows a velocity and seeks a force."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from us_sim.tracking.robot import Robot, RobotSettings
 
 
 class ProbeRobot(GuardedNode):
-    """``robot/twist`` and ``robot/force`` in, ``tracker/pose`` out; it feels ``probe/wrench``."""
+    """``robot/twist``, ``robot/force`` and ``probe/wrench`` in, ``tracker/pose`` out."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("probe_robot", **kwargs)

@@ -1,4 +1,4 @@
-"""Takes a device's measurements and publishes where the probe is, and how far that is known."""
+"""Tracking of the probe by a device's measurements, and the state of it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from us_sim.tracking.measurement import PATIENT, Measurement, TrackingState
 OWN = "probe_tracker"
 FARTHEST = 100.0  # m from the device's origin, beyond which a pose is in another unit, or nonsense
 OUTLINE, LINE_WIDTH = (0.31, 0.70, 0.75, 1.0), 4e-4  # colour and m, of the image in the marker
-CHECKS = 20.0  # times a second that the state is looked at when nothing comes
+CHECKS = 20.0  # a second, of the state when nothing comes
 LEVELS = {
     TrackingState.WAITING: DiagnosticStatus.STALE,
     TrackingState.TRACKED: DiagnosticStatus.OK,
@@ -53,12 +53,11 @@ class ProbeTracker(TrackerNode):
     """A source's measurements in; ``probe/pose``, ``tf``, ``tf_static`` and ``probe/status`` out.
 
     The source is ``tracker.source`` of the scene, or the parameter ``source``, see
-    `tracker_inputs`. A pose goes out once, with the stamp of its measurement. ``probe/status``,
-    latched, says whether the probe is ``tracked``, ``coasting`` or ``lost``, each time that
-    changes, and where it was last when it is tracked no more. ``probe/marker``, latched, is the
-    transducer to look at. ``tf_static`` has the device's frame in ``patient``, where it has one of
-    its own and tf is not the source: a driver's tree may hold it. Both need ``tf2_msgs``. The
-    filter and its settings may change while running.
+    `tracker_inputs`. A pose is published once, with the stamp of its measurement.
+    ``probe/status``, latched, is ``tracked``, ``coasting`` or ``lost``, the latter two with the
+    last pose. ``probe/marker``, latched, is the transducer to look at. ``tf_static`` has the
+    device's own frame in ``patient``, unless tf is the source: a driver's tree may hold it. Both
+    need ``tf2_msgs``. The filter and its settings may change while running.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -80,14 +79,12 @@ class ProbeTracker(TrackerNode):
             self._transforms = self.create_stream_publisher(TFMessage, "tf")
             self._publish_device_frame()
         self._status = self.create_latched_publisher(DiagnosticStatus, "probe/status")
-        self.create_latched_publisher(MarkerArray, "probe/marker").publish(
-            self._transducer_markers()
-        )
-        self._input: TrackerInput = TRACKERS.load(self._source)(
-            self, source_settings(self.scene, self._source)
-        )
+        marker = self.create_latched_publisher(MarkerArray, "probe/marker")
+        marker.publish(self._transducer_markers())
+        settings = source_settings(self.scene, self._source)
+        self._input: TrackerInput = TRACKERS.load(self._source)(self, settings)
         self.health.state = "waiting for poses"
-        self._say_status()
+        self._publish_status()
         if not self.lockstep:
             self.create_timer(1.0 / CHECKS, self._check)
 
@@ -96,34 +93,32 @@ class ProbeTracker(TrackerNode):
         if self._source != "tf" and device != PATIENT:
             place, _ = load_tracker_poses(self.scene)
             placed = transform_message(place, TimeMessage(), PATIENT, device)
-            self.create_latched_publisher(TFMessage, "tf_static").publish(
-                TFMessage(transforms=[placed])
-            )
+            publisher = self.create_latched_publisher(TFMessage, "tf_static")
+            publisher.publish(TFMessage(transforms=[placed]))
 
     def _transducer_markers(self) -> bytes:
-        """Make markers of the scene's transducer, where it has a collider, and its image."""
+        """Make markers of the image's outline and, if the scene has a collider, the transducer."""
         section = self.scene.probe.collider
         parts = build_transducer_mesh(build_collider(self.scene)) if section is not None else []
         shapes = [
             MarkerShape(p.name, (*p.colour, 1.0), p.vertices[p.triangles.ravel()]) for p in parts
         ]
         outline = compute_image_outline(build_probe(self.scene))
-        shapes.append(
-            MarkerShape("image", OUTLINE, np.concatenate([outline, outline[:1]]), LINE_WIDTH)
-        )
+        closed = np.concatenate([outline, outline[:1]])
+        shapes.append(MarkerShape("image", OUTLINE, closed, LINE_WIDTH))
         return serialize_markers(shapes, TimeMessage(), "probe")
 
     def _apply_settings(self, values: dict[str, Any]) -> None:
         self._tracking.filter = _filter(values)
 
     def destroy_node(self) -> None:
-        """Let go of the device, where it is held by more than subscriptions."""
+        """Close the source."""
         if hasattr(self, "_input"):  # it may have refused to be made
             self._input.close()
         super().destroy_node()
 
     def take_measurement(self, measurement: Measurement) -> None:
-        """Publish the probe's pose, if the measurement can be believed."""
+        """Publish the probe's pose, unless the measurement is refused."""
         distance = float(abs(measurement.pose.position).max())
         if distance > FARTHEST:
             self.refuse_measurement(
@@ -143,10 +138,8 @@ class ProbeTracker(TrackerNode):
                 "the tracker's poses start anew, and so does the filter", throttle_duration_sec=5.0
             )
         if probe is None:
-            tracking = self._tracking
-            self.health.count_problem(
-                tracking.last_refused, f"{tracking.last_problem}; it is not used"
-            )
+            problem = f"{self._tracking.last_problem}; it is not used"
+            self.health.count_problem(self._tracking.last_refused, problem)
             self._check()
             return
         stamp = stamp_message(probe.stamp)
@@ -166,7 +159,7 @@ class ProbeTracker(TrackerNode):
         self._check()
 
     def _check(self) -> None:
-        """Say so when the state has changed."""
+        """Publish and log the state if it has changed."""
         state = self._tracking.find_state(self.read_clock())
         if state is self._state:
             return
@@ -181,9 +174,9 @@ class ProbeTracker(TrackerNode):
             self.get_logger().info("the probe is tracked")
         self._state = state
         self.health.state = "waiting for poses" if state is TrackingState.WAITING else state.value
-        self._say_status()
+        self._publish_status()
 
-    def _say_status(self) -> None:
+    def _publish_status(self) -> None:
         status = DiagnosticStatus(
             level=LEVELS[self._state],
             name="probe",

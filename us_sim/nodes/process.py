@@ -25,18 +25,15 @@ from us_sim.nodes import INTERRUPTED, announce_often, explain_ros_error
 from us_sim.nodes.guarded_node import GuardedNode
 
 COMPUTING, MEASURING = 1, 2
-"""Realtime priorities of nodes. Those that hand on what a device measures take a millisecond, and
-go before those that compute for tens; drivers of devices may go before both."""
+"""Realtime priorities of nodes. Those that hand on measurements take a millisecond, and go before
+those that compute for tens; drivers of devices may go before both."""
 
 
 def raise_priority(priority: int = COMPUTING) -> str:
     """Let all present threads of this process go before ordinary ones, and none that they start.
 
-    Args:
-        priority: among realtime programs; the lowest, so that drivers of devices may go before.
-
     Returns:
-        How they run from now on: ``realtime``, or ``ordinary`` where that is not allowed.
+        ``realtime``, or ``ordinary`` if that is not allowed.
     """
     tried = range(priority, 0, -1) if hasattr(os, "sched_setscheduler") else ()
     able = any(_schedule(each) for each in tried)
@@ -44,10 +41,9 @@ def raise_priority(priority: int = COMPUTING) -> str:
 
 
 def raise_receiver_priority() -> None:
-    """Let the middleware's threads of this process go before ordinary programs, Python's not.
+    """Let the middleware's threads, not Python's, of this process go before ordinary programs.
 
-    They acknowledge what comes then, though Python waits for a core: publishers overwrite the few
-    messages that they keep for whoever does not.
+    So they acknowledge messages in time, and publishers do not overwrite those.
     """
     if hasattr(os, "sched_setscheduler"):
         _schedule(MEASURING, {thread.native_id for thread in threading.enumerate()})
@@ -67,25 +63,24 @@ def _schedule(priority: int, but: Collection[int | None] = ()) -> bool:
 
 
 TURN_S = 0.1
-"""For a turn in which nothing comes: Python's handlers of signals run between turns, and without a
-limit the events executor would wait in a busy loop."""
+"""Longest turn of the executor: Python's handlers of signals run between turns, and without a limit
+the events executor would wait in a busy loop."""
 
 _ENDINGS = (signal.SIGINT, signal.SIGTERM)
 
 _told_to_end = threading.Event()
-"""An exception of a handler is lost where it meets a destructor or a compiler's callback."""
+"""Set by signals: a handler's exception is lost in a destructor or in a compiler's callback."""
 
 signals_wait = threading.Event()
-"""From then on a signal waits for the callback's end: no message or solver is left halfway. Who
-sets it while a node is made must not take long from there."""
+"""Once it is set, a signal waits for the callback's end, so that no message is left halfway."""
 
 
 def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
-    """Spin the node until it is done or told to stop; the exit status.
+    """Make and spin a node until it is done or told to stop; return the exit status.
 
-    A node with a ``finished`` future ends when that is done; told to end before, or while it is
-    made, its status is `INTERRUPTED`, so that nobody takes its work for done. Bad input, also as
-    the exception of that future, is one sentence on stderr and exit status 1.
+    A node with a ``finished`` future ends when that is done. If it is told to end before, or while
+    it is made, the status is `INTERRUPTED`: its work is not done. Bad input, also as the exception
+    of that future, is one sentence on stderr and exit status 1.
     """
     for number in _ENDINGS:
         signal.signal(number, _interrupt_once)
@@ -97,7 +92,12 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception as error:  # what rcl raises for bad arguments differs between its versions
-        return _refused(explain_ros_error(error))
+        return _refuse(explain_ros_error(error))
+    return _make_and_spin(create)
+
+
+def _make_and_spin(create: Callable[[], Node]) -> int:
+    """Make and spin a node, destroy it and shut rclpy down; return the exit status."""
     node: Any = None
     try:
         node = create()
@@ -112,9 +112,9 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (UsSimError, ParameterException) as error:
-        return _refused(error)
+        return _refuse(error)
     except MemoryError:
-        return _refused(UsSimError("there is not enough memory"))
+        return _refuse(UsSimError("there is not enough memory"))
     except Exception:
         if rclpy.ok():  # a compiler that a signal breaks off fails with its own error
             raise
@@ -129,16 +129,11 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     if node is None or (finished is not None and not finished.done()):
         return INTERRUPTED
     problem = finished.exception() if finished is not None else None
-    return _refused(problem) if problem is not None else 0
+    return _refuse(problem) if problem is not None else 0
 
 
 def node_main(create: Callable[[], Node], module: str) -> Callable[..., int]:
-    """Return the function that runs a node; where its module is the program, run it and exit.
-
-    Args:
-        create: makes the node.
-        module: the ``__name__`` of the module whose ``main`` it is.
-    """
+    """Return the function that runs a node; if ``module`` is ``__main__``, run it and exit."""
     run = partial(run_node, create)
     if module == "__main__":
         sys.exit(run())
@@ -146,7 +141,7 @@ def node_main(create: Callable[[], Node], module: str) -> Callable[..., int]:
 
 
 def create_executor(node: Node) -> Executor:
-    """Return the executor that the node asks for, with the node."""
+    """Create the executor that the node asks for, and add the node."""
     executor: Executor = getattr(node, "executor_class", EventsExecutor)(context=node.context)
     # EventsExecutor calls a timer that is overdue when it is added once for each timer that follows
     # it, and each call sets the next one a period later: a slow start made a node silent for 5 s.
@@ -160,11 +155,8 @@ def create_executor(node: Node) -> Executor:
 def spin(node: Node, executor: Executor) -> None:
     """Run the node's callbacks until its future ``finished``, if any, is done, or it shall end.
 
-    Callbacks of a `GuardedNode` raise nothing, but rclpy does, for instance for a request of a
-    service that it cannot decode: that is counted and said as a failure of the node, too.
-
-    Raises:
-        ExternalShutdownException: rclpy was shut down.
+    Callbacks of a `GuardedNode` raise nothing. What rclpy raises, for instance for a request of a
+    service that it cannot decode, is a failure of the node, too, unless it was shut down.
     """
     finished = getattr(node, "finished", None)
     try:
@@ -184,7 +176,7 @@ def spin(node: Node, executor: Executor) -> None:
 
 
 def _interrupt_once(*_: object) -> None:
-    """End the node; a second signal, such as launch's after the terminal's, must not disturb it."""
+    """End the node; ignore a second signal, such as launch's after the terminal's."""
     for number in _ENDINGS:
         signal.signal(number, lambda *_: None)
     _told_to_end.set()
@@ -194,6 +186,6 @@ def _interrupt_once(*_: object) -> None:
     raise KeyboardInterrupt
 
 
-def _refused(error: Exception) -> int:
+def _refuse(error: Exception) -> int:
     print(f"us_sim: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
     return 1

@@ -4,14 +4,14 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 STREAM = QoSProfile(depth=10)  # reliable, volatile, keep last, as rclpy's is where nothing is said
-"""Poses, nodes and images inside the graph, as whoever wants the newest hears them."""
+"""Poses, nodes and images inside the graph, for subscribers that want the newest."""
 
 SENT = QoSProfile(depth=100)
-"""The same as they are published: kept until all have acknowledged them, so that a recorder that
-gets no processor for a second loses none."""
+"""The same for publishers: kept until all have acknowledged them, so that a recorder that gets no
+processor for a second loses none."""
 
 EVERY = QoSProfile(depth=1000)
-"""A lockstep consumer, which must not lose one."""
+"""Subscribers that must not lose a message, as in lockstep."""
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Topics published once, for later subscribers too."""
@@ -22,5 +22,5 @@ some may wait while the process does not get a processor."""
 
 
 def qos_override_options() -> QoSOverridingOptions:
-    """History, depth and reliability of a topic as parameters ``qos_overrides.…``."""
+    """Have history, depth and reliability of a topic as parameters ``qos_overrides.…``."""
     return QoSOverridingOptions.with_default_policies()

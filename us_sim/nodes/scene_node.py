@@ -1,4 +1,4 @@
-"""A node of a scene: its parameters and its health; who moves the probe."""
+"""A node of a scene: its parameters and its health; and who moves the probe."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ class SceneNode(GuardedNode):
         self.lockstep = settings.lockstep
         self.threads = settings.threads
         is_realtime = settings.realtime and not settings.lockstep
-        #: With which its process goes before ordinary ones; 0 is as one of them.
-        self.realtime_priority = self.live_priority if is_realtime else 0
+        self.realtime_priority = self.live_priority if is_realtime else 0  # 0: an ordinary process
         self.health = Health(self, self.scene.name)
 
 
@@ -35,13 +34,10 @@ NO_SENDER = "nobody publishes tracker/pose any more"
 
 
 def explain_missing_poses(node: GuardedNode) -> str:
-    """Return why no fault of a tracker keeps poses away, as at a path's end; empty if one may.
-
-    Where pages could move the probe, it is that none is open.
-    """
+    """Return why poses are missing without a fault of a tracker, as at a path's end, or nothing."""
     name = node.resolve_topic_name(LEAD_TOPIC)
-    hearers = [info.node_name for info in node.get_subscriptions_info_by_topic(name)]
-    if "probe_tracker" not in hearers or node.count_publishers(name):
+    listeners = [info.node_name for info in node.get_subscriptions_info_by_topic(name)]
+    if "probe_tracker" not in listeners or node.count_publishers(name):
         return ""
     viewer = (VIEWER, node.get_namespace())
     return NO_PAGE if viewer in node.get_node_names_and_namespaces() else NO_SENDER

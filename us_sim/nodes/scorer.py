@@ -1,4 +1,4 @@
-"""Says what the hand has done so far: metrics of the scan, and the steps of an exercise."""
+"""Scoring of the hand while it scans: metrics of the scan, and the steps of an exercise."""
 
 from __future__ import annotations
 
@@ -38,26 +38,24 @@ from us_sim.scoring.settings import CONTACT_FORCE, ScoreSettings
 
 _PERIOD = 200_000_000  # ns of the probe's poses, after which areas are measured again
 OWN = "scorer"
-_LEVELS = {
+_LEVELS = {  # by states of steps
     "done": DiagnosticStatus.OK,
     "missed": DiagnosticStatus.ERROR,
     "to do": DiagnosticStatus.WARN,
 }
-"""By states of steps."""
 _REMEMBERED = 256  # poses, for the image with the same stamp
 _CHANGING = ("tissue_deformer", "skin_deformer", "slice_interpolator", "probe_tracker")
-"""Nodes whose parameters decide what a learner meets."""
+"""Nodes whose changed parameters are noted in the result."""
 
 
 class Scorer(SceneNode):
     """``probe/pose``, ``probe/wrench`` and ``ultrasound/labels`` in, ``score`` once a second.
 
-    The first status has all metrics as values. The ``hardware_id`` of each that follows says what
-    it is: a ``step``, with what was seen of it and where it is to be done, OK when it is done and
-    an ERROR when it was missed; a ``fault``; ``plain``, the metrics that are read first, with what
-    became of the attempt; and ``about``, who did what with what.
-    The service ``~/clear`` begins anew; ``~/draw`` has a picture made, on ``score/picture``, which
-    is also made once the attempt has ended. Then its result is written, too.
+    The first status has all metrics as values. The others' kind is their ``hardware_id``: a
+    ``step``, with what was seen and where it is to be done, OK when it is done, an ERROR when it
+    was missed; a ``fault``; ``plain``, the metrics to read first and the state of the attempt; and
+    ``about``, the circumstances. The service ``~/clear`` begins anew; ``~/draw`` publishes a
+    picture on ``score/picture``. The end of the attempt does so, too, and writes the result.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -76,13 +74,12 @@ class Scorer(SceneNode):
         self._title = self._exercise.name if self._exercise is not None else self.scene.name
         results = self._settings.results
         self._place = ResultPlace(results) if results else None
-        self._void, self._is_known = "", False  # whether a result has told of this arm
-        if self._settings.begun:
-            self._void = "the scorer was started again: begin anew"
+        self._void = "the scorer was started again: begin anew" if self._settings.begun else ""
+        self._is_known = False  # a result has shown the truth about this arm
         self._begin_attempt()
         self._score = self.create_latched_publisher(DiagnosticArray, "score")
         self._picture = self.create_latched_publisher(CompressedImage, "score/picture")
-        self._picture.publish(CompressedImage())  # what a page has may be of a node before
+        self._picture.publish(CompressedImage())  # a page may have one of an earlier node
         self.subscribe(PoseStamped, "probe/pose", self._on_pose, EVERY)
         self.subscribe(WrenchStamped, "probe/wrench", self._on_wrench, EVERY)
         if self._live.lines:
@@ -90,11 +87,11 @@ class Scorer(SceneNode):
         self.subscribe(ParameterEvent, "/parameter_events", self._on_parameters, EVERY)
         self.create_command("clear", self._clear)
         self.create_command("draw", self._draw)
-        self.create_timer(1.0, self._tell)
+        self.create_timer(1.0, self._publish_score)
         self.health.state = "following"
 
     def destroy_node(self) -> None:
-        """Write what could not be written before, and the attempt that has not ended, too."""
+        """Write results that could not be written before, and that of the running attempt."""
         if self._place is not None:
             self._write(self._place.write_kept)
         self._keep_result(self._live.compute_score(), is_last=True)
@@ -139,7 +136,7 @@ class Scorer(SceneNode):
             self._live.set_answers(own.answers, own.thrombus)
 
     def _on_parameters(self, message: ParameterEvent) -> None:
-        """Note what a person changes of the simulation meanwhile, such as the method."""
+        """Note changes of the simulation during the attempt, such as of the method."""
         space = self.get_namespace().rstrip("/")
         node = message.node.removeprefix(f"{space}/")
         if node not in _CHANGING:
@@ -149,14 +146,14 @@ class Scorer(SceneNode):
             when = f"{self._seconds(nanoseconds_of(message.stamp)):.0f} s" if self._begin else "0 s"
             self._changes.append(f"{node}.{changed.name} = {value} at {when}")
 
-    def _tell(self) -> None:
-        is_heard = self._score.get_subscription_count() > 0
-        if not is_heard and self._place is None:
+    def _publish_score(self) -> None:
+        is_wanted = self._score.get_subscription_count() > 0
+        if not is_wanted and self._place is None:
             return
         score = self._live.compute_score()
         if score is None:
             return
-        if is_heard:
+        if is_wanted:
             self._score.publish(self._message(score))
             self.health.count_published("score")
         self._keep_result(score)
@@ -180,7 +177,7 @@ class Scorer(SceneNode):
         return message
 
     def _result(self, score: Score) -> dict[str, Any]:
-        """Return the document of `us_sim.scoring.result`."""
+        """Make the document of `us_sim.scoring.result`."""
         exercise, tissue = self._exercise, self.scene.tissue
         about = {
             "student": self._settings.student,
@@ -218,7 +215,7 @@ class Scorer(SceneNode):
         return exercise is not None and exercise.feedback == "afterwards" and not score.has_ended
 
     def _keep_result(self, score: Score | None, *, is_last: bool = False) -> None:
-        """Draw and write the result once the attempt has ended, or shall go on no more."""
+        """Draw and write the result, once, if the attempt has ended or this is its last chance."""
         is_due = score is not None and (score.has_ended or (is_last and score.seconds is not None))
         if score is None or not is_due or self._is_kept or self._exercise is None:
             return
@@ -268,20 +265,19 @@ class Scorer(SceneNode):
         asks = self._exercise is not None and self._exercise.feedback == "afterwards"
         self._is_known |= asks and score is not None and score.has_ended
         self._live.clear()
-        self._live_settings.restore_settings(
-            {OWN: replace(self._settings, answers=(), thrombus="")}
-        )
+        without = replace(self._settings, answers=(), thrombus="")
+        self._live_settings.restore_settings({OWN: without})
         self._void = ""
         self._begin_attempt()
-        self._picture.publish(CompressedImage())  # what was drawn is of before
+        self._picture.publish(CompressedImage())  # that of the former attempt goes
         return ""
 
 
 def _status(
     kind: str, message: str, values: Mapping[str, Any], level: bytes = DiagnosticStatus.OK
 ) -> DiagnosticStatus:
-    told = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-    return DiagnosticStatus(level=level, name=kind, message=message, hardware_id=kind, values=told)
+    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+    return DiagnosticStatus(level=level, name=kind, message=message, hardware_id=kind, values=pairs)
 
 
 main = node_main(Scorer, __name__)

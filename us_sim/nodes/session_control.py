@@ -1,4 +1,4 @@
-"""Stands for a running simulation: by its parameters scenes are loaded, recorded and replayed."""
+"""Control of a running simulation: parameters by which scenes are loaded, recorded, replayed."""
 
 from __future__ import annotations
 
@@ -22,21 +22,20 @@ from us_sim.scene.listing import ListedScene
 _FLOWING = ("position", "fraction", "record_seconds", "record_bytes", "record_room_bytes")
 """Values that change all the time, and are published once a second."""
 
-
 Use = Callable[[SessionControlSettings, Collection[str]], None]
-"""Called with what is wanted and the names of the parameters that were set."""
+"""Called with the settings and the names of the parameters that were set."""
 
 
 class SessionControl(GuardedNode):
     """A simulation's switches, for any machine on its ROS domain.
 
-    Its parameters are those of `SessionControlSettings`. What becomes of a change is in its
-    report on ``diagnostics``: `state`, and `fraction` while something is loaded.
+    Its parameters are those of `SessionControlSettings`. The progress of a change is in its report
+    on ``diagnostics``: `state`, and `fraction` while something is loaded.
 
     Args:
-        check: raises a UsSimError where that cannot be.
-        take: begins to do that; parameters that were not set stay in force.
-        settings: that it follows now.
+        check: raises a UsSimError for settings that cannot be.
+        take: begins to do what settings say; parameters that were not set stay in force.
+        settings: that are in force now.
     """
 
     def __init__(
@@ -44,13 +43,11 @@ class SessionControl(GuardedNode):
     ) -> None:
         super().__init__("session_control", **kwargs)
         self._check_wanted, self._take_wanted = check, take
-        self.values = declare_settings(
-            self, SessionControlSettings()
-        )  # present ones of the parameters
-        self._is_showing = False
-        self._told: tuple[object, ...] = ()
+        self.values = declare_settings(self, SessionControlSettings())
+        self._is_showing = False  # the parameters are being set to the present state
+        self._reported: tuple[object, ...] = ()
         self._player = cache(partial(AsyncParameterClient, self))
-        self._untold: dict[str, dict[str, Any]] = {}  # parameters for a node that plays
+        self._unsent: dict[str, dict[str, Any]] = {}  # parameters for a node that plays
         self.health = Health(self, "")
         self._scenes = self.create_latched_publisher(DiagnosticArray, "session/scenes")
         self._bags = self.create_latched_publisher(DiagnosticArray, "session/bags")
@@ -67,9 +64,9 @@ class SessionControl(GuardedNode):
             self._is_showing = False
 
     def publish_state(self, state: str, values: Mapping[str, str], warning: str = "") -> None:
-        """Report how things are; at once where more than the time in a replay has changed."""
+        """Report the state; at once if more than a time or a size has changed."""
         news = state, warning, {key: values[key] for key in values if key not in _FLOWING}
-        is_news, self._told = news != self._told, news
+        is_news, self._reported = news != self._reported, news
         self.health.state, self.health.warning = state, warning
         self.health.values = dict(values)
         self._hand_on()
@@ -78,22 +75,22 @@ class SessionControl(GuardedNode):
 
     def set_player_parameters(self, node: str, values: Mapping[str, Any]) -> None:
         """Set parameters of the node that plays, as soon as it is there."""
-        self._untold = {node: self._untold.get(node, {}) | dict(values)}
+        self._unsent = {node: self._unsent.get(node, {}) | dict(values)}
         self._hand_on()
 
     def _hand_on(self) -> None:
-        for node in [each for each in self._untold if self._player(each).services_are_ready()]:
-            values = self._untold.pop(node)
+        for node in [each for each in self._unsent if self._player(each).services_are_ready()]:
+            values = self._unsent.pop(node)
             parameters = [Parameter(name, value=each) for name, each in values.items()]
             self._player(node).set_parameters(parameters)
 
     @property
     def is_list_wanted(self) -> bool:
-        """Whether somebody hears which scenes there are."""
+        """True if somebody subscribes to the list of scenes."""
         return self._scenes.get_subscription_count() > 0
 
     def publish_scenes(self, scenes: Sequence[ListedScene]) -> None:
-        """Publish which scenes and cases can be loaded."""
+        """Publish the scenes and cases that can be loaded."""
         message = DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()))
         for scene in scenes:
             status = DiagnosticStatus(
@@ -114,7 +111,7 @@ class SessionControl(GuardedNode):
         self._scenes.publish(message)
 
     def publish_bags(self, bags: Mapping[str, str]) -> None:
-        """Publish which bags can be played: files by name."""
+        """Publish the bags that can be played: files by name."""
         message = DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()))
         message.status = [
             DiagnosticStatus(name=name, hardware_id=file, message="bag")
@@ -123,12 +120,11 @@ class SessionControl(GuardedNode):
         self._bags.publish(message)
 
     def _wanted(self, parameters: list[Parameter]) -> SessionControlSettings:
-        """A volume belongs to the scene that it was set with."""
-        wanted = settings_with(self.values, parameters)
+        """Return the settings with new parameters; another scene loses the volume of the last."""
         names = {each.name for each in parameters}
         if "scene" in names and "volume" not in names:
-            wanted = settings_with(wanted, [Parameter("volume", value="")])
-        return wanted
+            parameters = [*parameters, Parameter("volume", value="")]
+        return settings_with(self.values, parameters)
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         if self._is_showing:

@@ -1,4 +1,4 @@
-"""Follows the reports of a session's nodes on `diagnostics`, and reports losses."""
+"""Monitoring of a session's nodes by their reports on `diagnostics`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.qos import EVERY
 from us_sim.nodes.settings import RECORDER
 
-TOLD = 50  # losses that a report tells one by one, the newest
+TOLD = 50  # losses that a report lists, the newest
 
 
 class SessionMonitor(GuardedNode):
@@ -25,8 +25,8 @@ class SessionMonitor(GuardedNode):
     def __init__(self, nodes: Collection[str] = (), **kwargs: Any) -> None:
         super().__init__("session_monitor", **kwargs)
         self._nodes = frozenset(nodes)
-        self.reports: dict[str, dict[str, str]] = {}  # the last of each node
-        self.messages: dict[str, str] = {}  # likewise
+        self.reports: dict[str, dict[str, str]] = {}  # values of each node's last report
+        self.messages: dict[str, str] = {}  # messages of these reports
         self.heard: Counter[tuple[str, int]] = Counter()  # reports by node and process
         self.recordings: dict[str, int] = {}  # processes by the files that they record
         self._published: dict[tuple[str, int], dict[str, int]] = {}
@@ -59,23 +59,20 @@ class SessionMonitor(GuardedNode):
             del self.reports[name], self.messages[name]
 
     def report_losses(self, losses: Sequence[str]) -> None:
-        """Report all losses so far, each in words, at once and from now on."""
+        """Report all losses so far, each a sentence, at once and from now on."""
         first = max(len(losses) - TOLD, 0)
-        told = {f"lost {i}": text for i, text in enumerate(losses[first:], first + 1)}
-        self.health.values = {"lost": str(len(losses)), **told}
+        listed = {f"lost {i}": text for i, text in enumerate(losses[first:], first + 1)}
+        self.health.values = {"lost": str(len(losses)), **listed}
         self.health.warning = losses[-1]
         self.health.publish_report()
 
     def count_messages(self, node: str, topic: str) -> int:
-        """How many messages ``node`` says it has published (or recorded) on ``topic``.
-
-        Those that it published before it was started again count, too.
-        """
+        """Return the messages that ``node`` reports on ``topic``, also by its earlier processes."""
         return sum(
             counts.get(topic, 0) for (name, _), counts in self._published.items() if name == node
         )
 
 
 def _number(text: str) -> int:
-    """The number in a report of whoever may write there; 0 where it is none."""
+    """Return the number in a stranger's report, or 0."""
     return int(text) if text.isdecimal() and len(text) < 20 else 0

@@ -1,4 +1,4 @@
-"""Publishes a whole recording again, as it was: to look at it in RViz or Foxglove."""
+"""A player of whole recordings, for RViz or Foxglove."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import BagMessage, BagTopic
 
 DEPTH = 10  # messages that publishers keep
-
 START_S = 0.5  # for subscribers to find the publishers before the first message
-_SHOWN = 100_000_000
-"""ns of a recording that are published at once where it is gone to, so that there is an image."""
+_SHOWN = (
+    100_000_000  # ns of a recording that are published at once after a jump: one image at least
+)
 
 
 class SessionPlayer(RecordingPlayer):
@@ -49,7 +49,7 @@ class SessionPlayer(RecordingPlayer):
             self.get_logger().warning(self._bag.fault)
         self._messages: Iterator[BagMessage] = iter(())
         self._waiting: BagMessage | None = None
-        self._shown = -1  # of the recording, ns: until when it is shown while it is paused
+        self._shown = -1  # ns of the recording that are published even if it is paused
         self._start = self.create_timer(START_S, self._begin)
 
     def _offer(self, topic: BagTopic) -> str:
@@ -81,7 +81,7 @@ class SessionPlayer(RecordingPlayer):
         self.begin_playing()
 
     def send_due(self) -> bool:
-        """Send the messages that are due; while it is paused only what is shown."""
+        """Send the messages that are due; while it is paused only those after a jump."""
         elapsed = self._shown
         if not self.settings.paused:
             elapsed = max(elapsed, self.head.compute_position(self.now))
@@ -95,9 +95,9 @@ class SessionPlayer(RecordingPlayer):
         self._waiting = self._next()
 
     def go_to(self, position: int, at: int | None = None) -> None:
-        """Have the messages from there on wait, and show a moment of them even if it is paused.
+        """Play on from a position; without a time ``at``, show a moment of it even if paused.
 
-        The last of what is kept for those who come later is sent again.
+        The last latched messages before it are sent again.
         """
         self.damage.clear()
         since = self.first + position if position > 0 else None
@@ -110,7 +110,7 @@ class SessionPlayer(RecordingPlayer):
         self.head.go_to(position, self.now if at is None else at)
 
     def _next(self) -> BagMessage | None:
-        """The next message; damaged parts are reported, and skipped where possible."""
+        """Return the next message, or None; report damaged parts, and skip them if possible."""
         known = len(self.damage)
         try:
             message = next(self._messages, None)

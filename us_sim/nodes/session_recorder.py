@@ -1,4 +1,4 @@
-"""Records every topic of the session, as it was serialized, to MCAP."""
+"""A recorder of all topics of a session to MCAP, as they were serialized."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ _WITHOUT_METADATA = (
 class SessionRecorder(GuardedNode):
     """Subscribes to each topic as soon as it appears, with the quality its publishers offer.
 
-    Its parameters are those of `SessionRecorderSettings`, its service is ``~/stop``.
-    Topics that are made on demand, such as ``ultrasound/image_annotated``, are recorded only where
-    ``topics`` or ``also`` names them: they are large, and follow from others.
+    Its parameters are those of `SessionRecorderSettings`, its service is ``~/stop``. Topics that
+    are made on demand, such as ``ultrasound/image_annotated``, are recorded only if ``topics`` or
+    ``also`` names them: they are large, and follow from others.
     """
 
     executor_class = SingleThreadedExecutor  # rclpy's EventsExecutor hands on no message's number
@@ -57,9 +57,9 @@ class SessionRecorder(GuardedNode):
         )
         _load_types()
         self._attachments = collect_attachments(settings)
-        self._refused: set[tuple[str, str]] = set()  # topics of a type, as has been said
+        self._refused: set[tuple[str, str]] = set()  # topics of a type
         self._topics: dict[str, RecordedTopic] = {}
-        self._told: Counter[str] = Counter()  # losses of which a person was told
+        self._reported: Counter[str] = Counter()  # losses
         self._bag: WriteBehind | None = None  # None once it was stopped
         self._latched: dict[str, tuple[str, bytes, int, int]] = {}  # that came while it was paused
         self.health = Health(self, settings.file)
@@ -76,14 +76,10 @@ class SessionRecorder(GuardedNode):
             for kept in self._latched.values():
                 self._bag.put_message(*kept)
             self._latched.clear()
-        self._tell_state()
+        self._update_state()
 
     def stop_recording(self) -> str:
-        """End the recording: its file gets its index, and can be moved away.
-
-        Returns:
-            Why that cannot be, or nothing.
-        """
+        """End the recording, so that its file gets its index; return why that fails, or nothing."""
         if self._bag is None:
             return "nothing is recorded any more"
         for topic in self._topics.values():
@@ -98,8 +94,8 @@ class SessionRecorder(GuardedNode):
         with contextlib.suppress(Exception):  # ROS may be shut down already
             if problem:
                 self.health.count_problem("disk", problem)
-            self._tell_losses(bag)
-            self._tell_state()
+            self._report_losses(bag)
+            self._update_state()
         return ""
 
     def destroy_node(self) -> None:
@@ -129,11 +125,11 @@ class SessionRecorder(GuardedNode):
         now = self.get_clock().now().nanoseconds
         for name, (media_type, data) in self._attachments.items():
             self._bag.attach_file(name, media_type, data, now)
-        self._tell_state()
+        self._update_state()
         self.get_logger().info(f"recording to {bag.path}")
 
     def _measure(self) -> dict[str, str]:
-        """Return which file is written, since when, how large it is, and the room that is left."""
+        """Return the file, its duration and size, and the room that is left."""
         values = {"file": str(self._file), "seconds": f"{time.monotonic() - self._began:.0f}"}
         with contextlib.suppress(OSError):  # it was taken away
             values["bytes"] = str(self._file.stat().st_size)
@@ -141,7 +137,7 @@ class SessionRecorder(GuardedNode):
         return values
 
     def _note(self, sentence: str) -> None:
-        """Say what is to be known of the file, also in diagnostics."""
+        """Log a sentence about the file, and put it in diagnostics."""
         self.health.values["note"] = sentence
         self.get_logger().info(sentence)
 
@@ -172,7 +168,7 @@ class SessionRecorder(GuardedNode):
         self._topics[topic] = recorded
 
     def _offered(self, topic: str, type_name: str) -> list[Qos]:
-        """Quality of service of the topic's publishers of that type."""
+        """Return the quality of service of the topic's publishers of that type."""
         publishers = self.get_publishers_info_by_topic(topic)
         return [qos_of(each.qos_profile) for each in publishers if each.topic_type == type_name]
 
@@ -190,7 +186,7 @@ class SessionRecorder(GuardedNode):
             self._latched[topic] = message
 
     def _time_of_arrival(self, info: Mapping[str, Any]) -> int:
-        """ns: when the middleware had a message; a recorder that starves takes it later."""
+        """Return the ns at which the middleware had a message, before a starving recorder had."""
         clock: Any = self.get_clock()
         received: int = info.get("received_timestamp") or 0
         is_known = received > 0 and not clock.ros_time_is_active  # which is another clock's
@@ -207,11 +203,11 @@ class SessionRecorder(GuardedNode):
                 self._bag.add_topic(topic.name, topic.type_name, new)
         self.health.fault = "" if self._bag is None else self._bag.problem
         if self._bag is not None:
-            self._tell_losses(self._bag)
+            self._report_losses(self._bag)
 
-    def _tell_losses(self, bag: WriteBehind) -> None:
+    def _report_losses(self, bag: WriteBehind) -> None:
         lost = bag.losses
-        new, self._told = lost - self._told, lost
+        new, self._reported = lost - self._reported, lost
         self.health.dropped = lost.total()
         while bag.untold:
             self.health.count_problem("disk", bag.untold.popleft())
@@ -220,22 +216,20 @@ class SessionRecorder(GuardedNode):
                 "lost", f"{format_count(new.total(), 'message')} of {', '.join(new)} not recorded"
             )
 
-    def _tell_state(self) -> None:
-        if self._bag is None:
-            self.health.state = "stopped"
-        else:
-            self.health.state = "paused" if self._settings.paused else "recording"
+    def _update_state(self) -> None:
+        active = "paused" if self._settings.paused else "recording"
+        self.health.state = "stopped" if self._bag is None else active
 
 
 def _gap_before(file: Path, stem: str) -> float:
-    """Return s since the files before this one, whose names begin so, were written; 0 without."""
+    """Return the s since earlier files whose names begin with ``stem`` were written, or 0."""
     before = [each for each in file.parent.glob("*.mcap") if each.name.startswith(stem)]
     written = [each.stat().st_mtime for each in before if each != file]
     return time.time() - max(written) if written else 0.0
 
 
 def _load_types() -> None:
-    """Import the types of the graph's messages: while messages come there is no time for it."""
+    """Import the types of the graph's messages now, before messages come."""
     for type_name in {topic.type_name for topic in TOPICS}:
         with contextlib.suppress(BagError):  # not every type is everywhere
             cls = message_type(normalize_type(type_name))

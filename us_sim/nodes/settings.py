@@ -1,7 +1,7 @@
 """Parameters of each node, with unit, range and meaning, without any ROS.
 
-A node declares them with `us_sim.nodes.parameters`; `us-sim` checks ``--param`` with them before
-anything is started; the tables of `docs/reference.md` are made from them.
+Nodes declare them with `us_sim.nodes.parameters`, `us-sim` checks ``--param`` with them before it
+starts anything, and `us-sim reference` prints them.
 """
 
 from __future__ import annotations
@@ -67,16 +67,13 @@ class AnnotatedImageSettings(Settings):
 
 
 RECORDER, VIEWER = "session_recorder", "viewer"
-PLAYERS = ("path_player", "session_player")
-"""Nodes that play what was recorded."""
+PLAYERS = ("path_player", "session_player")  # of recordings
 _SPEED = Quantity("number", 0.01, 100.0)
 _SPAN = Quantity("time", 0.0, 1e6)
-NOT_THE_SESSION = ("/rosout", "/parameter_events")
-"""Topics that are not recorded."""
-SHARED = ("/tf", "/tf_static")
-"""Topics that a recorder takes outside its namespace, too: frames may be common to all."""
+NOT_THE_SESSION = ("/rosout", "/parameter_events")  # topics that are not recorded
+SHARED = ("/tf", "/tf_static")  # topics that are recorded outside the recorder's namespace, too
 OF_SIMULATORS = tuple(f"/{topic.name}" for topic in TOPICS if not topic.is_from_drivers)
-"""How the names of topics end that only a simulator publishes, in whichever namespace it is."""
+"""Ends of names of topics that only a simulator publishes, in whichever namespace it is."""
 
 
 @dataclass(frozen=True)
@@ -195,9 +192,9 @@ class SessionRecorderSettings(Settings):
     attach: tuple[str, ...] = setting(description="more files to attach", default=())
 
     def records_topic(self, topic: str, namespace: str = "/") -> bool:
-        """Whether a recorder in this namespace records a topic, given by its full name.
+        """Return whether a recorder in this namespace records a topic of that full name.
 
-        Topics of another simulator, and those made on demand, it records only by name.
+        It records topics of another simulator, and those made on demand, only by name.
         """
 
         def among(*names: str) -> bool:
@@ -300,7 +297,7 @@ class TissueDeformerSettings(Settings):
     )
 
     def check(self) -> None:
-        """Two different methods."""
+        """Require two different methods."""
         if self.compare_with == self.solver:
             raise self.make_error(
                 "compare_with", f"{self.solver} is in use already: compare with another solver"
@@ -452,23 +449,21 @@ NODES: dict[str, tuple[type[Settings], ...]] = {
     "image_writer": (ImageWriterSettings,),
     "viewer": (ViewerSettings,),
 }
-"""The settings whose fields are a node's parameters; those of parts of a scene come on top."""
+"""Settings that are parameters of a node; `parameters_of` adds those of parts of its scene."""
 
 _ROS_OWN = ("use_sim_time", "qos_overrides.", "start_type_description_service")
 """Parameters that rclpy itself declares, or prefixes of them."""
 
 
 def is_live(settings: type[Settings], name: str) -> bool:
-    """Whether a setting may change while the node runs."""
+    """Return whether a setting may change while the node runs."""
     return settings.live or rules_of(settings)[name].live
 
 
 def parameters_of(node: str, scene: Scene | None = None) -> Iterator[tuple[str, type[Settings]]]:
-    """The settings that are parameters of a node, each with the prefix of their names.
+    """Yield the settings that are parameters of a node, each with the prefix of their names.
 
-    Args:
-        node: its name.
-        scene: it works on; its probe and materials have parameters too.
+    Parts of the scene that it works on have parameters, too.
     """
     for settings in NODES[node]:
         yield "", settings
@@ -478,38 +473,35 @@ def parameters_of(node: str, scene: Scene | None = None) -> Iterator[tuple[str, 
                 yield f"{name}.", FILTERS.load_settings(name)
     if node == "skin_deformer":
         yield "membrane.", MembraneSettings
-    if scene is None:
-        return
-    if node == "slice_interpolator":
-        yield "", type(build_probe(scene))
-        yield "acoustics.", SoundSettings
-        for label in scene.imaging.acoustics.tissues:
-            yield f"{TISSUE_PARAMETERS}{label}.", TissueAcoustics
-        yield "m_mode.", type(scene.m_mode)
-        if scene.tissue is not None:
-            yield "strain.", type(scene.strain)
-        if scene.flows:
-            yield "colour.", type(scene.colour)
-            yield "spectrum.", type(scene.spectrum)
-        for name, flow in scene.flows.items():
-            yield f"flow.{name}.", type(flow)
-    if node == "tissue_deformer" and scene.tissue is not None:
+    if node == "slice_interpolator" and scene is not None:
+        yield from _imaging_parameters(scene)
+    if node == "tissue_deformer" and scene is not None and scene.tissue is not None:
         for solver in SOLVERS.importable:
             yield f"{solver}.", SOLVERS.load_settings(solver)
         for label, material in scene.tissue.materials.items():
             yield f"materials.{label}.", type(material)
 
 
-def check_parameters(node: str, scene: Scene | None, given: Mapping[str, str]) -> dict[str, object]:
-    """Values of a node's parameters in SI units, from a person's texts.
+def _imaging_parameters(scene: Scene) -> Iterator[tuple[str, type[Settings]]]:
+    yield "", type(build_probe(scene))
+    yield "acoustics.", SoundSettings
+    for label in scene.imaging.acoustics.tissues:
+        yield f"{TISSUE_PARAMETERS}{label}.", TissueAcoustics
+    yield "m_mode.", type(scene.m_mode)
+    if scene.tissue is not None:
+        yield "strain.", type(scene.strain)
+    if scene.flows:
+        yield "colour.", type(scene.colour)
+        yield "spectrum.", type(scene.spectrum)
+    for name, flow in scene.flows.items():
+        yield f"flow.{name}.", type(flow)
 
-    Args:
-        node: its name.
-        scene: it works on, if it works on one.
-        given: YAML texts by name.
+
+def check_parameters(node: str, scene: Scene | None, given: Mapping[str, str]) -> dict[str, object]:
+    """Convert a person's YAML texts, by name, to values of a node's parameters in SI units.
 
     Raises:
-        UsSimError: there is no such parameter, or its value will not do.
+        UsSimError: there is no such parameter, or its value is refused.
     """
     if not given:
         return {}
@@ -560,8 +552,8 @@ def to_setting_value(kind: Any, raw: Any) -> Any:
 def to_parameter_value(kind: Any, value: Any) -> Any:
     """Convert the value of a setting of this type to that of a parameter.
 
-    ROS parameters have no value for nothing: a number that is not given is 0, such a list is one
-    of zeros, and such a text is empty. An empty list would have no type.
+    ROS has no parameter without a value: a number that is not given is 0, a text empty, and a list
+    has one zero or empty text, since an empty list has no type.
     """
     lists = [each for each in (kind, *get_args(kind)) if get_origin(each) is tuple]
     if lists:

@@ -1,4 +1,4 @@
-"""Deforms the skin membrane under the probe."""
+"""Deformation of the skin membrane under the probe."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _COLOUR = (0.85, 0.65, 0.55)  # red, green, blue
 class SkinDeformer(SceneNode):
     """``probe/pose`` in; ``skin/nodes`` and ``skin/marker`` out; rest surface latched.
 
-    Its own parameters are those of `SkinDeformerSettings`; markers are for the eye. Those of the
-    membrane may change, too: it is made anew, and settles under the probe again.
+    Its own parameters are those of `SkinDeformerSettings`. Those of the membrane may change while
+    it runs: it is made anew, and settles under the probe again.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -46,9 +46,8 @@ class SkinDeformer(SceneNode):
         self._membrane.warm_up()
         self._nodes = self.create_stream_publisher(PointCloud2, "skin/nodes")
         self._marker = self.create_stream_publisher(Marker, "skin/marker")
-        self.create_latched_publisher(Mesh, "skin/mesh").publish(
-            mesh_message(surface.vertices, surface.triangles)
-        )
+        rest = self.create_latched_publisher(Mesh, "skin/mesh")
+        rest.publish(mesh_message(surface.vertices, surface.triangles))
         self.subscribe(PoseStamped, "probe/pose", self._on_pose, newest=True)
         self.health.state = "ready"
         self.get_logger().info("ready")
@@ -58,7 +57,7 @@ class SkinDeformer(SceneNode):
             self._membrane = self._membrane.with_settings(values["membrane."])
 
     def report_failure(self, where: str, error: Exception) -> None:
-        """Begin anew, too: the membrane may have been left halfway."""
+        """Count and log a failure, and reset the membrane, which may have been left halfway."""
         super().report_failure(where, error)
         self._membrane.reset()
 
@@ -70,11 +69,9 @@ class SkinDeformer(SceneNode):
         stamp = message.header.stamp
         skin = self._membrane.deform(pose_from(message, "patient"))
         if wanted:
-            columns = [*skin.vertices.T, *skin.normals.T]
             names = ["x", "y", "z", "normal_x", "normal_y", "normal_z"]
-            self._nodes.publish(
-                cloud_message(dict(zip(names, columns, strict=True)), stamp, "patient")
-            )
+            columns = dict(zip(names, [*skin.vertices.T, *skin.normals.T], strict=True))
+            self._nodes.publish(cloud_message(columns, stamp, "patient"))
             self.health.count_published("skin/nodes", stamp)
         if shown:
             colour = (*_COLOUR, self._settings.values["markers"].marker_opacity)
@@ -85,7 +82,7 @@ class SkinDeformer(SceneNode):
         self.health.values = {"residual": f"{skin.residual:.3g}", "action": skin.action}
 
     def _is_marker_due(self, message: PoseStamped) -> bool:
-        """Whether a marker's time has passed since the last one, or the stamps went back."""
+        """Return whether a marker's period has passed since the last, or stamps went back."""
         stamp = nanoseconds_of(message.header.stamp)
         rate = self._settings.values["markers"].marker_rate
         if 0 <= stamp - self._marked < 0.99e9 / rate:

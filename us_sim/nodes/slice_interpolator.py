@@ -1,4 +1,4 @@
-"""Makes the B-mode image at the probe's plane through the deformed tissue."""
+"""Imaging of the deformed tissue in the probe's plane."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ def _together(values: dict[str, Any]) -> tuple[Probe, Imaging, Acoustics]:
     return values["probe"], values["imaging"], acoustics
 
 
-_BEYOND = 1e-3  # m, by which an image may be too deep before that is said
+_BEYOND = 1e-3  # m, by which an image may be too deep without a report
 
 _NONE, _POOR = 0.02, 0.5  # coupling, averaged over the face, below which contact is none or poor
 _SEEN = ("contact", "no_colour", "no_spectrum")
-"""Diagnostics that are sent at once when they change: they say why an image shows nothing."""
+"""Diagnostics that are sent at once when they change: the reasons of an empty image."""
 
 REMEMBERED = 256  # poses kept for the deformed nodes that carry their stamps
 SKINS_REMEMBERED = 64
@@ -53,10 +53,10 @@ class SliceInterpolator(SceneNode):
     """``probe/pose`` and, with tissue, ``tissue/nodes`` in; ``ultrasound/image`` out.
 
     With tissue an image is made for every set of nodes, at the pose with the same stamp; without,
-    for every pose, through the volume as it is. ``ultrasound/image_to_probe``, latched, says where
-    its pixels are. ``ultrasound/image_annotated`` is for the eye, see `AnnotatedImage`, and
-    `create_frame_streams` are further topics, each made of the same frame for those who subscribe. What a
-    sonographer sets are parameters.
+    for every pose, through the volume as it is. ``ultrasound/image_to_probe``, latched, is the map
+    of its pixels. ``ultrasound/image_annotated``, see `AnnotatedImage`, and the topics of
+    `create_frame_streams` are made of the same frame for their subscribers. The sonographer's
+    settings are parameters.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -71,11 +71,11 @@ class SliceInterpolator(SceneNode):
         self._scanner.apply_settings(probe, imaging, acoustics)
         self._rest: Any = None
         self._tetrahedra: Any = None
-        self._carried = False
+        self._has_mesh = False
         self._poses: dict[int, Pose] = {}
-        self._is_said = False  # that the image is too deep
+        self._has_warned = False  # that the image is too deep
         self._seen: dict[str, str] = {}  # `_SEEN` in the diagnostics that were sent
-        self._number = 0  # of what images are made from
+        self._number = 0  # of the frame
         self._unpaired: PointCloud2 | None = None
         self._skins: dict[int, NDArray[np.float64]] | None = None  # (V, 3) m, by stamps
         self._streams = create_frame_streams(self, volume, probe)
@@ -98,7 +98,7 @@ class SliceInterpolator(SceneNode):
         self.get_logger().info("ready")
 
     def _declare_console(self) -> LiveSettings:
-        """Declare what a sonographer sets: of probe, image and sound, also by tissue."""
+        """Declare the sonographer's settings: of probe, image and sound, also by tissue."""
         probe, imaging = build_probe(self.scene), self.scene.imaging
         tissues = imaging.acoustics.tissues.items()
         return LiveSettings(
@@ -123,7 +123,7 @@ class SliceInterpolator(SceneNode):
         changed = probe != self._scanner.probe
         self._scanner.apply_settings(probe, imaging, acoustics)
         if changed:
-            self._is_said = False
+            self._has_warned = False
             self._places.publish(affine_message(probe.image_to_probe))
             self._annotated.change_probe(probe)
 
@@ -140,7 +140,7 @@ class SliceInterpolator(SceneNode):
             return
         nodes = vectors_from(self._rest, "patient")
         self._scanner.attach_mesh(nodes, tetrahedra_from(self._tetrahedra))
-        self._carried = True
+        self._has_mesh = True
 
     def _on_pose(self, message: PoseStamped) -> None:
         _remember(self._poses, message, self._pose(message), REMEMBERED)
@@ -165,16 +165,16 @@ class SliceInterpolator(SceneNode):
         return pose
 
     def _image_unpaired(self) -> None:
-        """Make the image whose other half may have come."""
-        if self._unpaired is not None and _nanoseconds(self._unpaired) in self._poses:
+        """Make the image of waiting nodes if their pose has come."""
+        if self._unpaired and nanoseconds_of(self._unpaired.header.stamp) in self._poses:
             self._on_nodes(self._unpaired)
 
     def _on_nodes(self, message: PointCloud2) -> None:
-        stamp = _nanoseconds(message)
+        stamp = nanoseconds_of(message.header.stamp)
         pose = self._poses.get(stamp)
-        # Live, the skin is there before the tissue all but always, and is not waited for.
+        # Live, the skin nearly always comes before the tissue, and is not waited for.
         has_skin = self._skins is None or not self.lockstep or stamp in self._skins
-        if pose is None or not self._carried or not has_skin:
+        if pose is None or not self._has_mesh or not has_skin:
             self._unpaired = message
             return
         self._unpaired = None
@@ -192,10 +192,10 @@ class SliceInterpolator(SceneNode):
             return
         stamp = source.header.stamp
         nodes = None if tissue is None else vectors_from(tissue, "patient")
-        came = nanoseconds_of(stamp)
-        skin = None if self._skins is None else self._skins.get(came)
+        time = nanoseconds_of(stamp)
+        skin = None if self._skins is None else self._skins.get(time)
         frame = self._scanner.make_frame(
-            pose, nodes, skin=skin, number=self._number, time=1e-9 * came
+            pose, nodes, skin=skin, number=self._number, time=1e-9 * time
         )
         self.health.values = self._report_reach(pose)  # what streams say of this frame comes on top
         for stream in wanted:
@@ -213,15 +213,16 @@ class SliceInterpolator(SceneNode):
             self.health.publish_report()
 
     def _report_reach(self, pose: Pose) -> dict[str, str]:
-        """Report in diagnostics that the image ends beyond the tissue or volume.
+        """Return, for diagnostics, how far the image reaches beyond the tissue or volume.
 
-        It is said once where not only the press makes it do so, so that a smaller depth helps.
+        Warn once if it does so without a press, too, so that a smaller depth helps.
         """
-        too_deep = self._scanner.measure_excess_depth(pose)
+        scanner = self._scanner
+        too_deep = scanner.measure_excess_depth(pose)
         if too_deep < _BEYOND:
             return {}
-        if not self._is_said and self._scanner.measure_excess_depth(pose, pressed=False) >= _BEYOND:
-            self._is_said = True
+        if not self._has_warned and scanner.measure_excess_depth(pose, pressed=False) >= _BEYOND:
+            self._has_warned = True
             what = "tissue's mesh" if self.scene.tissue is not None else "volume"
             self.get_logger().warning(
                 f"the image reaches {1e3 * too_deep:.0f} mm beyond the {what}: what lies there is "
@@ -241,13 +242,9 @@ def _contact(frame: Frame) -> dict[str, str]:
 def _remember(
     values: dict[int, Any], message: PoseStamped | PointCloud2, value: Any, most: int
 ) -> None:
-    values[_nanoseconds(message)] = value
+    values[nanoseconds_of(message.header.stamp)] = value
     while len(values) > most:
         del values[next(iter(values))]
-
-
-def _nanoseconds(message: PoseStamped | PointCloud2) -> int:
-    return nanoseconds_of(message.header.stamp)
 
 
 main = node_main(SliceInterpolator, __name__)

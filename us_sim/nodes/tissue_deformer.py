@@ -1,7 +1,8 @@
-"""Deforms the tissue under the probe, and shows its structures."""
+"""Deformation of the tissue under the probe, and of its structures."""
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Mapping
@@ -51,16 +52,15 @@ from us_sim.tracking.haptic import ContactModel, rotate_to_patient
 
 OWN = "tissue_deformer"
 STRUCTURES = "tissue/structures"
-PREPARED_CHECK_S = 0.1  # how often it is checked whether what was set is ready
+PREPARED_CHECK_S = 0.1  # between checks for a method that has been prepared
 _MATERIALS = "materials."
 
 
 class StructureMarkers:
-    """``tissue/structures``: a TRIANGLE_LIST of each structure, where the tissue has carried it.
+    """``tissue/structures``: a TRIANGLE_LIST of each structure, deformed with the tissue.
 
-    Their surfaces are made when the first subscriber has come, in a thread, while the tissue goes
-    on being deformed; in lockstep they are made at once, so that no pose is without. How fine they
-    are and how often they are sent are the parameters of `StructureMarkersSettings`.
+    When the first subscriber comes, a thread makes the surfaces; in lockstep the node waits for it.
+    Their resolution and rate are the parameters of `StructureMarkersSettings`.
 
     Args:
         node: that publishes them, of a scene that has structures.
@@ -78,7 +78,7 @@ class StructureMarkers:
         self.state = "not made, nobody subscribes"
 
     def is_due(self, stamp: TimeMessage) -> bool:
-        """Whether somebody subscribes, the surfaces are there, and a marker's time has come."""
+        """Return whether somebody subscribes, the surfaces exist, and a marker's period is over."""
         if self._publisher.get_subscription_count() == 0:
             return False
         if self._making is None:
@@ -95,7 +95,7 @@ class StructureMarkers:
         return not 0 <= since < 0.99e9 / self._settings.values["markers"].marker_rate
 
     def publish_markers(self, nodes: NDArray[np.float64], stamp: TimeMessage) -> None:
-        """Send the structures as they are when the tissue's nodes (N, 3) are there, m."""
+        """Publish the structures deformed with the tissue's nodes (N, 3), m."""
         self._sent = nanoseconds_of(stamp)
         shapes = []
         for made in self._structures:
@@ -132,29 +132,26 @@ class StructureMarkers:
 
 ALWAYS = TimeMessage()  # the stamp of what does not change: zero, which tf takes as the latest
 GO_ON_S = 0.05
-"""Time without a pose after which an unfinished frame is gone on with. It is longer than a frame:
-an executor serves timers before messages."""
-VISIBLE_M = 5e-5
-"""How far a node must have moved for the frame that was gone on with to be sent again."""
+"""Time without a pose after which an unfinished frame is continued. It is longer than a frame: an
+executor serves timers before messages."""
+VISIBLE_M = 5e-5  # by which a node must have moved for a continued frame to be published again
 
 
 class TissueDeformer(SceneNode):
     """``probe/pose`` in; ``tissue/nodes``, ``probe/wrench`` out; mesh latched.
 
-    ``tissue/structures`` too where the scene has structures, see `StructureMarkers`, and for a
-    haptic arm ``tissue/contact_model``: the wrench at a pose and how it changes from there.
+    For structures also ``tissue/structures``, see `StructureMarkers`, and for a haptic arm
+    ``tissue/contact_model``: the wrench at a pose and its derivative.
 
-    Of a frame whose forces are not in balance, as on a computer with too little time, no wrench is
-    sent, nor a contact model: it would be several times what the tissue exerts. Diagnostics count
-    such frames (``unbalanced``).
+    A frame whose forces are not in balance, as on a slow computer, has neither wrench nor contact
+    model: they would be several times too large. Diagnostics count such frames (``unbalanced``).
 
     The method, the settings of every method and the materials are parameters that may change while
-    running, see `LiveTissue`: what is set is prepared while the tissue goes on as it was, or at
-    once in lockstep; what cannot be made is said and set back. With ``compare_with`` another method
-    runs on the same poses, and diagnostics say how far its nodes are from those published. Once a
-    second they estimate how far the frame's nodes are from the continuum's
-    (``discretisation_error_percent``) and, while no pose comes, the force from its
-    (``force_error_percent``), where the method can.
+    running, see `LiveTissue`: a change is prepared while the tissue goes on as it was, or at once
+    in lockstep; one that fails is logged and set back. With ``compare_with`` another method runs on
+    the same poses, and diagnostics have the distance of its nodes from those published. Once a
+    second they estimate the error of the frame's nodes (``discretisation_error_percent``) and,
+    while no pose comes, of the force (``force_error_percent``), if the method can.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -174,19 +171,16 @@ class TissueDeformer(SceneNode):
         mesh = self._tissue.model.mesh
         self._nodes = self.create_stream_publisher(PointCloud2, "tissue/nodes")
         self._wrench = self.create_stream_publisher(WrenchStamped, "probe/wrench")
-        is_felt = scene.tracker.source.name == "haptic"
-        self._contact = (
-            self.create_stream_publisher(Float64MultiArray, "tissue/contact_model")
-            if is_felt
-            else None
-        )
+        self._contact = None
+        if scene.tracker.source.name == "haptic":
+            contact_model = self.create_stream_publisher(Float64MultiArray, "tissue/contact_model")
+            self._contact = contact_model
         rest = self.create_latched_publisher(PointCloud2, "tissue/rest")
         tetrahedra = self.create_latched_publisher(Int32MultiArray, "tissue/tetrahedra")
         rest.publish(self._cloud(mesh.nodes, ALWAYS))
         if not self.lockstep:
-            self._pace = FramePace(
-                time_shortest_run(lambda: rest.publish(self._cloud(mesh.nodes, ALWAYS)))
-            )
+            seconds = time_shortest_run(lambda: rest.publish(self._cloud(mesh.nodes, ALWAYS)))
+            self._pace = FramePace(seconds)
             self.get_logger().info(f"a frame may take {1e3 * self._pace.limit:.1f} ms")
             self.create_timer(GO_ON_S, self._finish_frame)
             self.create_timer(PREPARED_CHECK_S, self._check_prepared)
@@ -205,7 +199,7 @@ class TissueDeformer(SceneNode):
         self.get_logger().info(self.health.state)
 
     def report_failure(self, where: str, error: Exception) -> None:
-        """Begin anew after a frame that failed: the tissue may have been left halfway."""
+        """Count and log a failure, and reset the tissue, which may have been left halfway."""
         super().report_failure(where, error)
         if where != STRUCTURES:  # which another thread makes
             self._tissue.reset()
@@ -227,7 +221,7 @@ class TissueDeformer(SceneNode):
         return LiveTissue(model, method, constants, late_progress("preparing the tissue"))
 
     def _prepare(self, values: dict[str, Any]) -> None:
-        """Prepare what parameters have been set to."""
+        """Prepare the method that the parameters ask for."""
         method, own = _method_of(values), values[OWN]
         compared = f" compared with {own.compare_with}" if own.compare_with else ""
         changed = [key for key in values if values[key] != self._used[key]]
@@ -240,12 +234,9 @@ class TissueDeformer(SceneNode):
         self.health.publish_report()
 
     def _check_prepared(self) -> None:
-        """Go on with what is ready; set parameters back where it cannot be made."""
-        tissue, before, preparing = (
-            self._tissue,
-            self._tissue.solver.name,
-            self._tissue.preparation_status,
-        )
+        """Adopt a method that is ready; set the parameters back if it cannot be made."""
+        tissue = self._tissue
+        before, preparing = tissue.solver.name, tissue.preparation_status
         try:
             adopted = tissue.adopt_prepared()
         except SolverError as error:
@@ -262,7 +253,7 @@ class TissueDeformer(SceneNode):
 
     @property
     def _state(self) -> str:
-        """The method in use, and what is being prepared."""
+        """The method in use, and the one that is being prepared."""
         return ", ".join(filter(None, (self._tissue.solver.name, self._tissue.preparation_status)))
 
     def _on_pose(self, message: PoseStamped) -> None:
@@ -277,7 +268,7 @@ class TissueDeformer(SceneNode):
             self._pace.count_frame(1e-9 * (time.monotonic_ns() - self.arrived))
 
     def _finish_frame(self) -> None:
-        """Finish the last frame while no pose comes; publish it again only if that is visible."""
+        """Continue the last frame while no pose comes; publish a visible change."""
         idle, self._came = self._came == 0, 0
         if not idle:
             return
@@ -286,15 +277,15 @@ class TissueDeformer(SceneNode):
         if last and not self._tissue.solver.is_settled and self._is_wanted(last.header.stamp):
             pose, was_balanced = pose_from(last, "patient"), self._is_balanced
             deformation = self._tissue.deform(pose, self._pace.limit)
-            is_felt_anew = deformation.is_balanced and not was_balanced
-            if is_felt_anew or np.abs(deformation.nodes - self._sent).max() >= VISIBLE_M:
+            is_newly_balanced = deformation.is_balanced and not was_balanced
+            if is_newly_balanced or np.abs(deformation.nodes - self._sent).max() >= VISIBLE_M:
                 self._publish(deformation, pose, last.header.stamp)
             else:
                 self._describe(deformation)
         self._estimate(has_time=True)
 
     def _is_wanted(self, stamp: TimeMessage) -> bool:
-        """Whether somebody subscribes to what a frame yields."""
+        """Return whether somebody subscribes to a topic of the frame."""
         return bool(
             self._nodes.get_subscription_count()
             or self._wrench.get_subscription_count()
@@ -310,9 +301,8 @@ class TissueDeformer(SceneNode):
             self._nodes.publish(self._cloud(deformation.nodes, stamp))
             self.health.count_published("tissue/nodes", stamp)
         if deformation.is_balanced and self._wrench.get_subscription_count():
-            self._wrench.publish(
-                wrench_message(deformation.force, deformation.torque, stamp, "probe")
-            )
+            force, torque = deformation.force, deformation.torque
+            self._wrench.publish(wrench_message(force, torque, stamp, "probe"))
             self.health.count_published("probe/wrench")
         if deformation.is_balanced and self._is_contact_wanted:
             self._publish_contact_model(pose, deformation, stamp)
@@ -326,16 +316,15 @@ class TissueDeformer(SceneNode):
     def _publish_contact_model(
         self, pose: Pose, deformation: Deformation, stamp: TimeMessage
     ) -> None:
-        """Publish the model at a pose, just solved for."""
+        """Publish the model of the contact at the pose of the last frame."""
         assert self._contact is not None
         wrench = rotate_to_patient(pose, deformation.force, deformation.torque)
-        try:
+        stiffness = None
+        with contextlib.suppress(np.linalg.LinAlgError):
             stiffness = self._tissue.solver.compute_contact_stiffness()
-        except np.linalg.LinAlgError:
-            stiffness = None
+        if stiffness is None:
+            stiffness = np.zeros((6, 6))
         try:
-            if stiffness is None:
-                stiffness = np.zeros((6, 6))
             model = ContactModel(nanoseconds_of(stamp), pose, wrench, stiffness)
         except TrackingError as error:
             self.health.count_problem("contact_model", f"{error}; it is not published")
@@ -345,9 +334,8 @@ class TissueDeformer(SceneNode):
 
     def _describe(self, deformation: Deformation) -> None:
         if deformation.inverted:
-            self.health.count_problem(
-                "inside out", _inside_out(deformation, self._tissue.solver.name)
-            )
+            problem = _inside_out(deformation, self._tissue.solver.name)
+            self.health.count_problem("inside out", problem)
         self.health.warning = ""
         if not deformation.is_balanced:
             self._unbalanced += 1
@@ -374,11 +362,7 @@ class TissueDeformer(SceneNode):
             }
 
     def _estimate(self, *, has_time: bool = False) -> None:
-        """Estimate the error of the first frame after a report.
-
-        Args:
-            has_time: whether no pose waits: the force's error takes as long as a frame.
-        """
+        """Estimate the errors of the first frame after a report; the force's takes a frame long."""
         if self._is_estimate_due:
             self._is_estimate_due = False
             solver = self._tissue.solver
@@ -399,7 +383,7 @@ class TissueDeformer(SceneNode):
 
 
 def _method_of(values: Mapping[str, Any]) -> TissueMethod:
-    """The method that the values of the node's parameters ask for, by their keys."""
+    """Return the method that the values of the node's parameters, by their keys, ask for."""
     begin = len(_MATERIALS)
     materials = {key[begin:-1]: values[key] for key in values if key.startswith(_MATERIALS)}
     settings = {name: values[f"{name}."] for name in SOLVERS.importable}

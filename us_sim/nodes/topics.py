@@ -21,22 +21,20 @@ class Topic:
     name: str
     type_name: str  # package and message: geometry_msgs/PoseStamped
     description: str  # for a person
-    publishers: Sequence[str] = ()  # nodes of this package; none where a driver publishes it
+    publishers: Sequence[str] = ()  # nodes of this package; none if a driver publishes it
     subscribers: Sequence[str] = ()
-    latched: bool = False  # kept for those who come later, else of each moment
+    latched: bool = False  # kept for later subscribers
     on_demand: bool = False  # not recorded, and so not computed, unless the recorder names it
 
     @property
     def is_from_drivers(self) -> bool:
-        """Whether it comes from outside this package, or from a node in place of a driver."""
+        """True if it comes from outside this package, or from a node in place of a driver."""
         stand_ins = {"path_player", "camera_driver", "space_mouse_driver", "probe_robot", "viewer"}
         return set(self.publishers) <= stand_ins
 
 
-FROZEN = "frozen"
-"""The text of a page that freezes its image."""
+FROZEN = "frozen"  # the text of a page that freezes its image
 
-
-_TOLD = load_yaml(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
-TOPICS = tuple(Topic(name, **about) for name, about in _TOLD.items())
+_KNOWN = load_yaml(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
+TOPICS = tuple(Topic(name, **about) for name, about in _KNOWN.items())
 """Those of ``topics.yaml``, which lies beside this file."""

@@ -20,17 +20,14 @@ from us_sim.settings.setting import rules_of
 from us_sim.share import full_path
 
 LARGEST = 4 * 1024 * 1024
-"""Bytes of a file that is attached itself; of larger ones, such as volumes, the checksum is."""
+"""Bytes of a file that is attached; of larger files, such as volumes, only the checksum is."""
 
 
 def collect_attachments(settings: SessionRecorderSettings) -> dict[str, tuple[str, bytes]]:
-    """Media types and contents by file names.
+    """Collect media types and contents by file names.
 
     ``scene.yaml`` is the scene with all that it is based on. It names attached files as they are
     extracted beside it, and others by their paths, which `files.txt` lists with their checksums.
-
-    Raises:
-        UsSimError: there is no such scene or file, or it cannot be read.
     """
     attached = {"versions.txt": ("text/plain", list_versions().encode())}
     if settings.parameters:
@@ -59,7 +56,7 @@ def collect_attachments(settings: SessionRecorderSettings) -> dict[str, tuple[st
 def _attach_scene(
     attached: dict[str, tuple[str, bytes]], settings: SessionRecorderSettings
 ) -> dict[Path, str]:
-    """Attach a scene and its small files; the checksums of all its files."""
+    """Attach a scene and its small files; return the checksums of all its files."""
     document, folders, origin = read_scene_document(str(settings.scene))
     if settings.volume:
         document = with_volume(document, settings.volume)
@@ -83,7 +80,7 @@ def _attach_scene(
 
 
 def find_files(path: Path) -> list[Path]:
-    """The files of a bag, a case, a series of DICOM or another folder; or the file itself."""
+    """Find the files of a bag, a case, a series of DICOM or another folder; or the file itself."""
     if not path.is_dir():
         return [path]
     try:
@@ -93,7 +90,7 @@ def find_files(path: Path) -> list[Path]:
 
 
 def _attach(attached: dict[str, tuple[str, bytes]], path: Path, name: str = "") -> bool:
-    """Attach a file by its own name or another; False if there is one of that name already."""
+    """Attach a file by its own name or another; return False if the name is taken."""
     name = name or path.name
     if name in (*attached, "scene.yaml", "files.txt"):
         return False
@@ -124,7 +121,7 @@ def _files(settings: Any) -> Iterator[Path]:
 
 
 def _placed(document: Any, places: dict[Path, str]) -> Any:
-    """The document with files named by where they are once it is extracted."""
+    """Return the document with files named by their places once it is extracted."""
     if isinstance(document, dict):
         return {key: _placed(value, places) for key, value in document.items()}
     if isinstance(document, list):
@@ -137,11 +134,7 @@ def _placed(document: Any, places: dict[Path, str]) -> Any:
 
 
 def file_checksum(path: Path) -> str:
-    """SHA-256 in hexadecimal digits; dashes for what is no file.
-
-    Raises:
-        UsSimError: it cannot be read.
-    """
+    """Compute the SHA-256 of a file in hexadecimal digits; dashes for what is no file."""
     if not path.is_file():
         return "-" * 64
     try:

@@ -1,4 +1,4 @@
-"""Playing a recording: rate, pause, place and end, as parameters say."""
+"""Playing of recordings: rate, pause, place and end, as parameters say."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from us_sim.share import find_bag
 
 
 class RecordingPlayer(GuardedNode):
-    """Does as the parameters of a player say, and its service ``~/stop``.
+    """A player that obeys its parameters and its service ``~/stop``.
 
-    It publishes ``/clock`` where its parameter ``clock`` asks for that, and then goes by the
-    computer's clock itself; else by its node's, also where that is set back.
+    If its parameter ``clock`` is set it publishes ``/clock``, and goes by the computer's clock
+    itself; else it goes by its node's, also when that is set back.
 
     Args:
         name: of the node.
@@ -41,7 +41,7 @@ class RecordingPlayer(GuardedNode):
         self.finished = Future()
         self.health = Health(self, str(self.path))
         self.head = Playhead(chosen.rate)
-        self.first = self.length = 0  # ns: since 1970 when it was recorded, and how long it is
+        self.first = self.length = 0  # ns: begin of the recording since 1970, and its duration
         self.gap = 0  # ns, from its end to its start where it loops
         self.damage: list[str] = []  # found so far
         self.has_begun = self._is_stopped = False
@@ -55,14 +55,14 @@ class RecordingPlayer(GuardedNode):
 
     @property
     def settings(self) -> Any:
-        """Its parameters as they are now, of the class of those by default."""
+        """Present parameters, of the class of those by default."""
         return self._live.values["player"]
 
     @abstractmethod
     def go_to(self, position: int, at: int | None = None) -> None:
-        """Play on at a time of the recording, ns, from a time of `now` on.
+        """Play on from a position (ns) of the recording at a time of `now`.
 
-        Without that it plays on at once, and shows what is there even if it is paused.
+        Without a time it plays on at once, and shows what is there even if it is paused.
         """
 
     @abstractmethod
@@ -70,18 +70,16 @@ class RecordingPlayer(GuardedNode):
         """Send what is due; return whether it is at its end."""
 
     def hold_still(self) -> None:
-        """Do what is to be done while nothing moves."""
+        """Do what is necessary while nothing moves."""
 
     def describe_progress(self) -> dict[str, str]:
-        """Return how far it is, for diagnostics."""
-        return {
-            "position": f"{1e-9 * self.position:.3f}",
-            "duration": f"{1e-9 * self.length:.3f}",
-        }
+        """Return position and duration, for diagnostics."""
+        position, duration = 1e-9 * self.position, 1e-9 * self.length
+        return {"position": f"{position:.3f}", "duration": f"{duration:.3f}"}
 
     @property
     def now(self) -> int:
-        """ns, of the clock that the player goes by; 0 where simulated time has not begun."""
+        """Time of the player's clock, ns; 0 before simulated time has begun."""
         now = int(self.clock.now().nanoseconds)
         if now < self._latest:
             self.head.go_to(self.head.compute_position(self._latest), now)
@@ -90,11 +88,11 @@ class RecordingPlayer(GuardedNode):
 
     @property
     def position(self) -> int:
-        """ns from the recording's start, within it."""
+        """Position in the recording, ns from its start."""
         return min(max(self.head.compute_position(self.now), 0), self.length)
 
     def publish_time(self) -> TimeMessage:
-        """Return the present time: of the recording where ``/clock`` is, which is published."""
+        """Return the present time; with ``clock``, publish and return that of the recording."""
         if not self.settings.clock:
             return self.get_clock().now().to_msg()
         stamp = stamp_message(self.first + self.position)
@@ -103,12 +101,12 @@ class RecordingPlayer(GuardedNode):
         return stamp
 
     def begin_playing(self) -> None:
-        """Obey parameters from now on, and those that are set already."""
+        """Obey the parameters from now on."""
         self.has_begun = True
         self.apply_settings()
 
     def apply_settings(self) -> None:
-        """Go on at the rate that was set, or hold still; before it began there is nothing to do."""
+        """Go on at the rate that was set, or hold still; do nothing before it began."""
         if not self.has_begun:
             return
         self.head.set_rate(self.settings.rate, self.now)
@@ -118,7 +116,7 @@ class RecordingPlayer(GuardedNode):
         self._report()
 
     def play_on(self) -> None:
-        """Send what is due, and at the end begin anew, or be done; called again and again."""
+        """Send what is due, and at the end begin anew or end; a timer calls it."""
         if self.health.state == "finished" and not self._loops:
             self.hold_still()
             return
@@ -128,7 +126,7 @@ class RecordingPlayer(GuardedNode):
             self.begin_again_or_end()
 
     def begin_again_or_end(self) -> None:
-        """Play from the start on where it loops, else be done unless it shall stay."""
+        """Play again from the start if it loops, else end."""
         if self._loops:
             self._play()
             self.go_to(0, self.now + self.gap)
@@ -161,7 +159,7 @@ class RecordingPlayer(GuardedNode):
         return ""
 
     def _seek(self, parameters: list[Parameter]) -> None:
-        """Continue at a time, whenever it is set, even to the same value."""
+        """Play on from a time whenever it is set, even to the same value."""
         times = [round(1e9 * each.value) for each in parameters if each.name == "time"]
         if not self.has_begun or not times:
             return

@@ -1,4 +1,4 @@
-"""A subscription to serialized messages that follows the quality that publishers offer."""
+"""Recording of a topic: serialized messages, with the quality that its publishers offer."""
 
 from __future__ import annotations
 
@@ -20,21 +20,18 @@ QUEUE = 1000  # messages that may wait for the executor
 
 
 class RecordedTopic:
-    """Takes every message of a topic, from every publisher there is or comes.
+    """Takes every message of a topic, from all present and later publishers.
 
-    Where a publisher comes that cannot serve the subscription, a weaker one takes its place; what
-    is sent before that was found is missing.
+    If a publisher comes that cannot serve the subscription, a weaker one takes its place; messages
+    sent before that are missing.
 
     Args:
         node: that subscribes.
         name: of the topic, in full.
         type_name: of its messages.
-        offered: what its publishers offer.
-        take: called with a serialized message and where it comes from.
-        lost: called with a number of messages that did not come.
-
-    Raises:
-        BagError: the type is not known here.
+        offered: quality of service of its publishers.
+        take: called with the topic's name, a serialized message, and rclpy's facts about it.
+        lost: called with the topic's name and a number of messages that did not come.
     """
 
     def __init__(
@@ -57,11 +54,11 @@ class RecordedTopic:
 
     @property
     def is_latched(self) -> bool:
-        """Whether its publishers keep messages for those who come later."""
+        """True if its publishers keep messages for later subscribers."""
         return self._adopted.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
     def adopt_offers(self, offered: list[Qos]) -> list[Qos]:
-        """Follow the qualities that publishers offer now; those that none has offered before."""
+        """Follow the qualities that publishers offer now; return those that are new."""
         if len(offered) != self._publishers:
             self._publishers, self._sequence = len(offered), None
         new = [profile for profile in dict.fromkeys(offered) if profile not in self._offered]
@@ -75,7 +72,7 @@ class RecordedTopic:
         return new
 
     def take_remaining(self) -> None:
-        """Take the messages that wait for the executor; also after ROS was shut down."""
+        """Take the messages that wait for the executor, also after ROS was shut down."""
         handle = self._subscription.handle
         with handle:
             while taken := handle.take_message(self._type, True):
@@ -93,7 +90,7 @@ class RecordedTopic:
         )
 
     def _receive_all(self, data: bytes, info: Mapping[str, Any]) -> None:
-        """Take this message and all that wait behind it: a turn of the executor costs more."""
+        """Take this message and all that wait behind it, which costs less than a turn for each."""
         self._receive(data, info)
         self.take_remaining()
 
@@ -102,11 +99,11 @@ class RecordedTopic:
         self._take(self.name, data, info)
 
     def _count(self, sequence: int | None) -> None:
-        """Notice messages that are missing in the numbers of the only publisher.
+        """Count messages that are missing in the numbers of the only publisher.
 
         These show every loss, also in the queue of the subscription. But not every middleware gives
-        numbers, and those of several publishers cannot be told apart: a number that is lower is of
-        another one, of which the graph will tell.
+        numbers, and several publishers' mix: a number that is lower is of another publisher, which
+        the graph will show later.
         """
         if sequence is None or self._publishers != 1:
             return
@@ -118,13 +115,13 @@ class RecordedTopic:
         self._sequence = sequence
 
     def _count_lost(self, status: QoSMessageLostInfo) -> None:
-        """Notice what was lost on the way, as the middleware says, where numbers do not tell."""
+        """Count the losses that the middleware reports, if there are no numbers."""
         if self._publishers != 1 or self._sequence is None:
             self._lost(self.name, status.total_count_change)
 
 
 def _adopted(offered: Iterable[Qos]) -> QoSProfile:
-    """The quality of service that every publisher can serve, as rosbag2 chooses it."""
+    """Choose the quality of service that every publisher can serve, as rosbag2 does."""
     offered = list(offered)
     reliable = all(q.reliability == QosReliability.RELIABLE for q in offered)
     latched = all(q.durability == QosDurability.TRANSIENT_LOCAL for q in offered)
@@ -141,9 +138,7 @@ _MESSAGE_TYPE = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
 
 
 def message_type(name: str) -> Any:
-    """The class of a message type, of which a definition is known.
-
-    Nothing is imported for a name that is not known to be a message's: importing runs code.
+    """Import the class of a message type; only names with a known definition are imported.
 
     Raises:
         BagError: it is no message type's name, has no definition here, or its package for Python

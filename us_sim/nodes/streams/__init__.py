@@ -1,7 +1,4 @@
-"""Topics of images made from the frames of a scanner, for those who subscribe.
-
-Only those are there that a scene and its volume can provide.
-"""
+"""Topics of images made from a scanner's frames, as far as scene and volume provide them."""
 
 from __future__ import annotations
 
@@ -13,11 +10,7 @@ from us_sim.volume.volume import Volume
 
 
 def create_frame_streams(node: SceneNode, volume: Volume, probe: Probe) -> list[FrameStream]:
-    """All that can be made of the frames of the node's scene, in the order of making; prepared.
-
-    Raises:
-        UsSimError: one of them cannot be used with this probe, or a flow with its structure.
-    """
+    """Create and prepare the streams that the node's scene can provide, in the order of drawing."""
     further: list[FrameStream] = []
     if volume.labels is not None:
         further.append(FrameStream(node, "ultrasound/labels", lambda frame: frame.labels))
@@ -33,5 +26,5 @@ def create_frame_streams(node: SceneNode, volume: Volume, probe: Probe) -> list[
     further.append(create_m_mode_stream(node))
     for stream in further:
         stream.prepare(probe)
-    # Whoever waits for the images may begin when their topic is there, so it comes last.
+    # A player that waits for the images begins when their topic is there, so it comes last.
     return [FrameStream(node, IMAGE, lambda frame: frame.pixels), *further]

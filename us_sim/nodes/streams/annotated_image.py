@@ -1,4 +1,4 @@
-"""The image with millimetres, outlines, colours and its age, for those who look at it."""
+"""The image with millimetres, outlines, colours and its age, for people."""
 
 from __future__ import annotations
 
@@ -30,19 +30,15 @@ _TOPIC = "ultrasound/image_annotated"
 
 
 class MessageAge:
-    """The time since something came last, whatever its stamp says.
+    """The time since a message came, whatever its stamp: that may be of another clock.
 
-    A stamp may be of another clock, such as that of a tracker which is ahead, or of the day it was
-    recorded. What came ages while ROS's time goes on, and never by more than has really passed:
-    that time may be set, and stands still while a bag is paused.
-
-    Args:
-        node: whose clock is used.
+    The age grows with the node's time, which stands while a bag is paused, but never faster than
+    real time, since the node's may be set.
     """
 
     def __init__(self, node: GuardedNode) -> None:
         self._node = node
-        self._came: tuple[int, int] | None = None  # ns of ROS's time, and of one that nobody sets
+        self._came: tuple[int, int] | None = None  # ns of the node's time, and of real time
 
     def restart(self) -> None:
         """Count from now on."""
@@ -50,7 +46,7 @@ class MessageAge:
 
     @property
     def seconds(self) -> float | None:
-        """The age, s; None before the first has come."""
+        """The age, s; None before the first message."""
         if self._came is None:
             return None
         if self._node.get_clock().now().nanoseconds < self._came[0]:  # as when a bag starts again
@@ -60,8 +56,7 @@ class MessageAge:
         return 1e-9 * min(now - ros, time.monotonic_ns() - real)
 
 
-CHECKS = 5.0  # times a second that the age of the newest pose is looked at
-
+CHECKS = 5.0  # a second, of the age of the newest pose
 _AMBER, _RED, _GREY = (255, 176, 0), (235, 45, 45), (150, 150, 150)
 
 
@@ -69,15 +64,15 @@ class AnnotatedImage:
     """``ultrasound/image_annotated``: the image with outlines, scale and a badge.
 
     A picture is drawn for each image while somebody subscribes, with the colours of the stream
-    that the parameter ``overlay`` chooses. When no pose has come for a while, the last image is
-    sent again with a badge, under its own stamp; before the first pose a black one. In lockstep
-    nothing ages. Its parameters are those of `AnnotatedImageSettings`.
+    that the parameter ``overlay`` chooses. If no pose comes for a while, the last image is sent
+    again with a badge, under its own stamp; before the first pose a black one. In lockstep nothing
+    ages. Its parameters are those of `AnnotatedImageSettings`.
 
     Args:
         node: that publishes it.
-        probe: whose images they are.
+        probe: of the images.
         label_names: of the volume's labels.
-        streams: those there are, some of which have colours to be laid over the image.
+        streams: some have colours to be laid over the image.
     """
 
     def __init__(
@@ -110,12 +105,12 @@ class AnnotatedImage:
 
     @property
     def is_wanted(self) -> bool:
-        """Whether somebody subscribes."""
+        """True if somebody subscribes."""
         return bool(self._publisher.get_subscription_count() > 0)
 
     @property
     def state(self) -> str:
-        """Of the probe's pose: ``waiting`` for the first, ``live``, ``stale`` or ``lost``."""
+        """State of the probe's pose: ``waiting`` for the first, ``live``, ``stale`` or ``lost``."""
         age = self._pose_age.seconds
         if age is None:
             return "waiting"
@@ -125,7 +120,7 @@ class AnnotatedImage:
         return "lost" if age > shown.lost_after else "stale"
 
     def change_probe(self, probe: Probe) -> None:
-        """The images that come are of another probe; those before it are not shown again."""
+        """Annotate the images of another probe; those before are not shown again."""
         self._probe = probe
         is_flipped = self._live.values["shown"].flip
         self._annotation = Annotation(probe, self._structures, is_flipped=is_flipped)
@@ -133,24 +128,20 @@ class AnnotatedImage:
         self._stamp = TimeMessage()  # zero: of a picture of no pose
 
     def on_usable_pose(self) -> None:
-        """A pose that can be used has come, whether or not an image is made at it."""
+        """Count the pose's age anew, since a usable pose has come."""
         self._pose_age.restart()
 
     def publish_frame(self, frame: Frame, stamp: TimeMessage) -> None:
-        """Keep the frame of the pose with that stamp, and send its picture if wanted.
-
-        Raises:
-            UsSimError: there is no picture of it; then the one before is kept.
-        """
+        """Keep the frame of the pose with that stamp, and send its picture if it is wanted."""
         if self.is_wanted:
-            _ = frame.pixels
+            _ = frame.pixels  # if that fails, the frame before is kept
         self._frame, self._stamp = frame, stamp
         self._image_age.restart()
         if self.is_wanted:
             self._send(self._badge())
 
     def _check(self) -> None:
-        """Send the last image again, marked, once it is old; a black one where there is none."""
+        """Send the last image again, marked, once it is old, or a black one."""
         self._report()
         badge = self._badge()
         if badge is not None and self.is_wanted:
@@ -229,11 +220,7 @@ class AnnotatedImage:
             return None
 
     def _require_overlay(self, wanted: Mapping[str, AnnotatedImageSettings]) -> None:
-        """Refuse colours that this scene cannot provide.
-
-        Raises:
-            SettingsError: with what it can.
-        """
+        """Refuse colours that this scene cannot provide."""
         name = wanted["shown"].overlay
         if name not in ("none", *self._overlays):
             there = ", ".join(["none", *self._overlays])

@@ -20,16 +20,12 @@ from us_sim.slicing.frame import Frame
 from us_sim.slicing.settings import DopplerSettings
 from us_sim.volume.volume import Volume
 
-EVERY_S = 0.2  # between two searches for the vessel; of the frames' time
+EVERY_S = 0.2  # of the frames' time, between two searches for the vessel
 _OPACITY = 0.9
 
 
 def create_doppler_streams(node: SceneNode, volume: Volume) -> list[FrameStream]:
-    """The velocity of blood, its colour Doppler and its spectrum; flows are parameters of the node.
-
-    Raises:
-        SceneError: a structure with a flow is no tube, or its flow leads across it.
-    """
+    """Create the streams of blood: velocity, colour Doppler, spectrum; flows are parameters."""
     warm_up()
     blood = build_blood(node.scene, volume)
     vessels = {
@@ -52,11 +48,11 @@ def create_doppler_streams(node: SceneNode, volume: Volume) -> list[FrameStream]
 
 
 class VesselFollower:
-    """Keeps ``PREFIX.lateral`` and ``PREFIX.depth`` on a vessel where ``PREFIX.follow`` is set.
+    """Keeps the parameters ``lateral`` and ``depth`` on a vessel while ``follow`` is set.
 
     Args:
-        node: whose parameters they are.
-        prefix: of them, with its dot.
+        node: that has the parameters.
+        prefix: of the parameters, with its dot.
         blood: in the vessels.
     """
 
@@ -65,7 +61,7 @@ class VesselFollower:
         self._updated = 0.0  # s, of the frame's time
 
     def update(self, frame: Frame, settings: DopplerSettings, steering: float) -> None:
-        """Move it, for the frames to come; ``steering`` (rad) is that of beams from the face on."""
+        """Set the place for the frames to come; the beams are steered by ``steering`` (rad)."""
         if not settings.follow or 0.0 <= frame.time - self._updated < EVERY_S:
             return
         self._updated = frame.time
@@ -78,7 +74,7 @@ class VesselFollower:
 
 
 def _colour_streams(node: SceneNode, blood: Blood) -> list[FrameStream]:
-    """Return ``ultrasound/velocity``, exact along the beams, and its estimate, by ``colour.…``."""
+    """Create ``ultrasound/velocity``, exact along the beams, and its estimate, by ``colour.…``."""
     colour = AdjustableImager(node, ColourDoppler, node.scene.colour, "colour.")
     following = VesselFollower(node, "colour.", blood)
 
@@ -94,22 +90,18 @@ def _colour_streams(node: SceneNode, blood: Blood) -> list[FrameStream]:
         doppler = colour.for_frame(frame)
         return Overlay(estimate(frame), doppler.scale, _OPACITY, outline=doppler.outline)
 
+    def exact(frame: Frame) -> NDArray[np.float32]:
+        return colour.for_frame(frame).compute_true_velocity(blood, frame)
+
+    topic, prepare = "ultrasound/velocity", colour.prepare_for_probe
     return [
-        FrameStream(
-            node,
-            "ultrasound/velocity",
-            lambda frame: colour.for_frame(frame).compute_true_velocity(blood, frame),
-        ),
-        FrameStream(
-            *(node, "ultrasound/velocity_estimate", estimate),
-            prepare=colour.prepare_for_probe,
-            overlay=overlay,
-        ),
+        FrameStream(node, topic, exact),
+        FrameStream(node, f"{topic}_estimate", estimate, prepare=prepare, overlay=overlay),
     ]
 
 
 def _spectrum_stream(node: SceneNode, blood: Blood) -> FrameStream:
-    """Return ``ultrasound/spectrum``: velocities at the gate over time, by ``spectrum.…``."""
+    """Create ``ultrasound/spectrum``: velocities at the gate over time, by ``spectrum.…``."""
     spectra = AdjustableImager(
         node, Spectrum, node.scene.spectrum, "spectrum.", Spectrum.take_over_picture
     )

@@ -28,7 +28,7 @@ Values = NDArray[np.float32]
 
 
 def create_strain_streams(node: SceneNode) -> list[FrameStream]:
-    """Return both, by the scene's settings as parameters ``strain.…``."""
+    """Create the streams of both strains; the scene's settings are parameters ``strain.…``."""
     probes: list[Probe] = []  # that images come of
 
     def check(wanted: dict[str, StrainSettings]) -> None:
@@ -51,13 +51,9 @@ def _strain_stream(
     note: Callable[[Values], str],
     prepare: Callable[[Probe], None],
 ) -> FrameStream:
-    """Return a topic of strain, as values, or as colours with a note.
+    """Create a stream of the strain that ``make`` returns, None without an image to compare with.
 
-    Args:
-        node, topic, prepare: as of the stream.
-        live: the settings.
-        make: returns the strain of a frame; None where there is nothing to compare it with.
-        note: returns a line about it.
+    Its overlay is the strain as colours, with the line about it that ``note`` returns.
     """
     end = AdaptiveScale()
     make_once = lru_cache(maxsize=1)(make)
@@ -76,7 +72,7 @@ def _strain_stream(
 
 
 def _tissue_strain(node: SceneNode, live: LiveSettings) -> FrameStream:
-    """Return ``ultrasound/strain``: of the tissue itself, since rest or since an image before."""
+    """Create ``ultrasound/strain``: of the tissue itself, since rest or since an image before."""
     earlier = FrameHistory(lambda frame: frame.nodes)
     made: tuple[object, AxialStrain] | None = None  # the last mesh, and its strain
 
@@ -101,7 +97,7 @@ def _tissue_strain(node: SceneNode, live: LiveSettings) -> FrameStream:
 def _strain_estimate(
     node: SceneNode, live: LiveSettings, prepare: Callable[[Probe], None]
 ) -> FrameStream:
-    """Return ``ultrasound/strain_estimate``: between two images, from their grey values alone."""
+    """Create ``ultrasound/strain_estimate``: between two images, from their grey values alone."""
     earlier, correlation = FrameHistory(lambda frame: frame.pixels), 0.0
 
     def make(frame: Frame, settings: StrainSettings) -> Values | None:

@@ -1,4 +1,4 @@
-"""A topic of images made from frames, also by what a person sets while it runs."""
+"""A topic of images made from frames, by parameters that may change while it runs."""
 
 from __future__ import annotations
 
@@ -18,25 +18,20 @@ from us_sim.slicing.frame import Frame
 from us_sim.slicing.m_mode import MMode
 from us_sim.slicing.probe.probe import Probe
 
-IMAGE = "ultrasound/image"
-"""The topic whose age counts as the node's latency."""
+IMAGE = "ultrasound/image"  # the topic whose age is the node's latency
 
 
 class FrameStream:
     """One topic of images, made from each frame while somebody subscribes.
 
-    What is costly is taken from the frame, where others find it, too.
-
     Args:
         node: that publishes it.
         topic: its name.
-        draw: returns the pixels of a frame, as `image_message` takes them; None where there are
-            none.
+        draw: returns the pixels of a frame, as `image_message` takes them, or None.
         prepare: loads everything for images of a probe, so that the first is not late; it raises a
-            UsSimError where they cannot be made with that probe.
-        overlay: returns the colours that it lays over the frame's picture; None where it has none.
-        lines: returns lines (N, 2), column and row, that show in the annotated image where it
-            looks.
+            UsSimError if they cannot be made with that probe.
+        overlay: returns colours over the frame's picture, or None.
+        lines: returns lines (N, 2), column and row, that show its place in the annotated image.
     """
 
     def __init__(
@@ -55,7 +50,7 @@ class FrameStream:
 
     @property
     def is_wanted(self) -> bool:
-        """Whether somebody subscribes."""
+        """True if somebody subscribes."""
         return bool(self._publisher.get_subscription_count() > 0)
 
     def publish_frame(self, frame: Frame, stamp: Time) -> None:
@@ -70,14 +65,14 @@ M = TypeVar("M")
 
 
 class AdjustableImager(Generic[M]):
-    """What makes the images of a topic: an object for one probe and one state of its parameters.
+    """The object that makes a topic's images, made anew for another probe or other parameters.
 
     Args:
         node: that has the parameters.
-        make: makes the object; a ProbeError refuses what is set.
+        make: makes the object; a ProbeError refuses parameters.
         settings: the parameters by default.
         prefix: before their names.
-        go_on: has a new object take over what still holds of the one before.
+        go_on: has a new object take over what is still valid of the one before.
     """
 
     def __init__(
@@ -95,11 +90,7 @@ class AdjustableImager(Generic[M]):
         self._settings = LiveSettings(node, {prefix: settings}, self._require)
 
     def prepare_for_probe(self, probe: Probe) -> None:
-        """Check whether it can be made for this probe; the one in use stays.
-
-        Raises:
-            ProbeError: what is set lies outside the images of this probe.
-        """
+        """Make it for this probe if none is in use, else only check that this is possible."""
         wanted = probe, self._settings.values[self._prefix]
         made = self._make(*wanted)
         if self._made_for is None:
@@ -121,7 +112,7 @@ class AdjustableImager(Generic[M]):
 
 
 def create_m_mode_stream(node: SceneNode) -> FrameStream:
-    """Return ``ultrasound/m_mode``: the image along a line over time, by ``m_mode.…``."""
+    """Create ``ultrasound/m_mode``: the image along a line over time, by ``m_mode.…``."""
     m_mode = AdjustableImager(node, MMode, node.scene.m_mode, "m_mode.", MMode.take_over_picture)
     return FrameStream(
         *(node, "ultrasound/m_mode"),

@@ -1,4 +1,4 @@
-"""A camera that sees the markers on the probe's grip, whatever encoding its driver sends."""
+"""Poses from a camera that sees the markers on the probe's grip, in any usual encoding."""
 
 from __future__ import annotations
 
@@ -23,11 +23,7 @@ Decoder = Callable[[Any, str], NDArray[np.uint8]]
 
 
 def camera_model_from(message: CameraInfo) -> CameraModel:
-    """The camera that a driver describes.
-
-    Raises:
-        TrackingError: it is not calibrated, or the numbers are none of a camera.
-    """
+    """Return the camera that a driver describes; one that is not calibrated is refused."""
     return CameraModel(
         message.width,
         message.height,
@@ -57,12 +53,12 @@ class CameraInput(TrackerInput):
             device.subscribe(message_type, topic, callback, FOREIGN, newest=True)
 
     def reset(self) -> None:
-        """Forget where the probe was; the camera stays."""
+        """Forget the probe's last pose; the camera stays."""
         if self._source is not None:
             self._source.reset()
 
     def _on_description(self, message: CameraInfo) -> None:
-        message.header = Header()  # that of each image is another one
+        message.header = Header()  # it differs from image to image
         if message != self._described:
             self._described, self._source = message, None
             self._source = CameraSource(camera_model_from(message), self._body, self._settings)

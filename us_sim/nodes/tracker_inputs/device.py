@@ -1,4 +1,4 @@
-"""A source of poses, and the part of the probe tracker that it uses."""
+"""A source of poses, and the tracker's node as a source uses it."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from us_sim.tracking.probe_tracking import ProbeTracking
 
 
 class TrackerInput:
-    """Hands the measurements of one kind of source to the tracker, with `Device.take_measurement`.
+    """A source of poses, which hands its measurements to `TrackerNode.take_measurement`.
 
-    A source of poses is a subclass of this, registered in `us_sim.settings.registry.TRACKERS` or,
-    by another package, under the entry point group ``us_sim.trackers``.
+    Its subclasses are registered in `us_sim.settings.registry.TRACKERS` or, by another package,
+    under the entry point group ``us_sim.trackers``.
 
     Args:
-        device: the tracker, as far as inputs need it.
+        device: the tracker's node.
         settings: an instance of ``Settings``, from the scene.
     """
 
@@ -42,11 +42,11 @@ class TrackerInput:
         """Forget all measurements, since a callback has failed."""
 
     def close(self) -> None:
-        """Let go of the device, where it is held by more than subscriptions."""
+        """Close the device, if there are more than subscriptions."""
 
 
 class TrackerNode(SceneNode):
-    """The tracker as its input uses it: a node, and where measurements go."""
+    """The tracker's node, as sources use it."""
 
     live_priority = MEASURING
 
@@ -55,10 +55,10 @@ class TrackerNode(SceneNode):
 
     @abstractmethod
     def take_measurement(self, measurement: Measurement) -> None:
-        """Publish the probe's pose, if the measurement can be believed."""
+        """Publish the probe's pose, unless the measurement is refused."""
 
     def refuse_measurement(self, kind: str, sentence: str) -> None:
-        """Count and say, now and then, why a measurement is not used."""
+        """Count and log a measurement that is not used, with the reason."""
         self._tracking.count_refusal(kind, sentence)
         self.health.count_problem(kind, sentence)
 
@@ -68,7 +68,7 @@ class TrackerNode(SceneNode):
         super().report_bad_input(where, error)
 
     def report_failure(self, where: str, error: Exception) -> None:
-        """Begin anew, too, since the failed state may be of no use."""
+        """Count and log a failure, and begin anew, since the failed state may be corrupt."""
         super().report_failure(where, error)
         self._input.reset()
         self._tracking.reset()
@@ -76,15 +76,15 @@ class TrackerNode(SceneNode):
     def read_measurement(
         self, message: PoseStamped, topic: str, frame: str = ""
     ) -> tuple[int, Pose]:
-        """Return when a pose was measured, ns, and the pose.
+        """Return a message's stamp, ns, and its pose.
 
         Args:
-            message: that has come.
+            message: of ``topic``.
             topic: its name.
             frame: that it must be in; empty is the scene's.
 
         Raises:
-            FrameError: it is in another one.
+            FrameError: it is in another frame.
             PoseError: it is no pose.
             StampError: its stamp is no time.
         """
@@ -104,11 +104,7 @@ class TrackerNode(SceneNode):
         return self.stamp_of(message.header, topic), pose
 
     def stamp_of(self, header: Header, topic: str) -> int:
-        """Return when a message was measured, ns; its arrival where it does not say.
-
-        Raises:
-            StampError: the stamp is no time.
-        """
+        """Return the time of measurement, ns: a message's stamp, or now if it has none."""
         stamp = nanoseconds_of(header.stamp)
         if stamp == 0:
             self.health.count_problem("stamp", f"{topic} has no stamp: its time of arrival is used")
@@ -116,5 +112,5 @@ class TrackerNode(SceneNode):
         return stamp
 
     def read_clock(self) -> int:
-        """Return the present, ns."""
+        """Return the present time, ns."""
         return int(self.get_clock().now().nanoseconds)

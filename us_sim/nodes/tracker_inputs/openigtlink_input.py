@@ -1,4 +1,4 @@
-"""An OpenIGTLink server's poses: Plus, 3D Slicer, or a tracker that speaks it itself."""
+"""Poses from an OpenIGTLink server: Plus, 3D Slicer, or a tracker's own."""
 
 from __future__ import annotations
 
@@ -18,9 +18,8 @@ class OpenIGTLinkInput(TrackerInput):
         super().__init__(device, settings)
         tracker = device.scene.tracker
         self._by_arrival = settings.clock == "arrival"
-        self._take = device.create_newest_handler(
-            device.take_measurement, f"{settings.host}:{settings.port}"
-        )
+        server = f"{settings.host}:{settings.port}"
+        self._hand_on = device.create_newest_handler(device.take_measurement, server)
         self._client = OpenIGTLinkClient(settings, tracker.body, self._on_pose, self._on_error)
 
     def close(self) -> None:
@@ -32,7 +31,7 @@ class OpenIGTLinkInput(TrackerInput):
     def _on_pose(self, measurement: Measurement) -> None:
         if self._by_arrival or measurement.stamp == 0:
             measurement = dataclasses.replace(measurement, stamp=self._device.read_clock())
-        self._take(measurement)
+        self._hand_on(measurement)
 
     def _on_error(self, kind: str, sentence: str) -> None:
         self._device.call_soon(partial(self._device.refuse_measurement, kind, sentence))

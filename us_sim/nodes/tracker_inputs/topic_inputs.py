@@ -1,4 +1,4 @@
-"""Sources of poses on topics: any driver's, several bodies, a haptic arm, a SpaceMouse, tf."""
+"""Poses from topics: any driver's, one of several bodies, a haptic arm, a SpaceMouse, tf."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from us_sim.tracking.settings import HapticSettings, SixDofMouseSettings
 class PoseInput(TrackerInput):
     """``tracker/pose`` in the frame that the scene names; a driver's, or ``path_player``'s.
 
-    Where that is another one than ``patient``, a pose in ``patient`` is the probe's own: who knows
-    where the patient is needs neither registration nor calibration.
+    If that is not ``patient``, a pose in ``patient`` is the probe's own: it needs neither
+    registration nor calibration.
     """
 
     def __init__(self, device: TrackerNode, settings: Any) -> None:
@@ -37,7 +37,7 @@ class PoseInput(TrackerInput):
         device.subscribe(PoseStamped, "tracker/pose", self.on_pose, FOREIGN)
 
     def on_pose(self, message: PoseStamped) -> None:
-        """Hand on the measurement in a message."""
+        """Hand a message's measurement to the tracker."""
         of_probe = message.header.frame_id == PATIENT != self._frame
         frame = PATIENT if of_probe else self._frame
         stamp, pose = self._device.read_measurement(message, "tracker/pose", frame)
@@ -61,9 +61,8 @@ class PoseArrayInput(TrackerInput):
             )
             return
         entry = PoseStamped(header=message.header, pose=message.poses[self._entry])
-        self._device.take_measurement(
-            Measurement(*self._device.read_measurement(entry, "tracker/poses"))
-        )
+        stamp, pose = self._device.read_measurement(entry, "tracker/poses")
+        self._device.take_measurement(Measurement(stamp, pose))
 
 
 class HapticInput(TrackerInput):
@@ -104,7 +103,7 @@ class SixDofMouseInput(TrackerInput):
         self._take_deflections(list(message.axes), list(message.buttons), stamp, "spacenav/joy")
 
     def _on_twist(self, message: Twist) -> None:
-        """The same deflections without buttons; a driver that sends both is heard once."""
+        """Take deflections without buttons, unless the driver sends them with buttons, too."""
         if self._has_joy:
             return
         v, w = message.linear, message.angular
@@ -122,18 +121,15 @@ class SixDofMouseInput(TrackerInput):
 
 
 MOVING = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Many nodes share `tf`, this one too: the newest message alone would often be another's."""
-
+"""Many nodes share `tf`: the newest message alone would often be another node's."""
 STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
 STALE_S = 2.0  # by which a link of the chain may be older than another; some are stamped ahead
 
 
 class TfInput(TrackerInput):
     """The frame ``tracker.body`` in the frame ``tracker.frame``, each time that all between moved.
 
-    Its stamp is the latest at which every frame between is known, see `FrameChain`.
+    Its stamp is the latest time of which all frames between are known, see `FrameChain`.
     """
 
     def __init__(self, device: TrackerNode, settings: Any) -> None:
@@ -159,11 +155,11 @@ class TfInput(TrackerInput):
         device.subscribe(TFMessage, "tf_static", self._on_static, STATIC)
 
     def reset(self) -> None:
-        """Forget what moved; what is fixed is told once."""
+        """Forget what moved; what is fixed is sent only once."""
         self._chain.forget_motion()
 
     def _on_static(self, message: TFMessage) -> None:
-        """Keep static transforms; a chain of these alone makes no poses."""
+        """Keep static transforms; refuse a chain of these alone."""
         for child, parent, pose, _ in self._transforms(message):
             self._chain.set_fixed_link(child, parent, pose)
         if self._chain.is_fixed:
@@ -174,7 +170,7 @@ class TfInput(TrackerInput):
             )
 
     def _transforms(self, message: TFMessage) -> Iterator[tuple[str, str, Pose, Header]]:
-        """Child, parent, pose and header of each that is a pose."""
+        """Yield child, parent, pose and header of each transform that is a pose."""
         for transform in message.transforms:
             child = transform.child_frame_id.lstrip("/")
             parent = transform.header.frame_id.lstrip("/")
