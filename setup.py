@@ -19,7 +19,6 @@ NODES = [
     "nodes.session_recorder",
     "nodes.skin_deformer",
     "nodes.slice_interpolator",
-    "nodes.space_mouse_driver",
     "nodes.tissue_deformer",
     "viewer.viewer",
 ]

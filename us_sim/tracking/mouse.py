@@ -1,4 +1,4 @@
-"""A 6-DOF mouse that moves the probe, and the reports of a 3Dconnexion SpaceMouse.
+"""A 6-DOF mouse that moves the probe.
 
 Axes are those of ROS's `spacenav_node`: forward, left and up, then turns about these (REP 103),
 each ±1 at full deflection.
@@ -13,14 +13,11 @@ each ±1 at full deflection.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import TrackingError
 from us_sim.geometry import se3
 from us_sim.geometry.pose import Pose
 from us_sim.tracking.measurement import Measurement
@@ -112,105 +109,3 @@ class SixDofMouse:
         if 0 <= button < len(buttons):
             self._held[button] = bool(buttons[button])
         return self._held.get(button, False)
-
-
-FULL_DEFLECTION = 350.0  # the largest number that the device reports
-
-_TRANSLATION, _ROTATION, _BUTTONS = 1, 2, 3  # numbers of reports
-# The device's axes are right, towards the person, and down. Forward is against its second.
-_ORDER = (1, 0, 2, 4, 3, 5)
-_LOGITECH, _3DCONNEXION = 0x046D, 0x256F
-# Before 3Dconnexion had a number of its own: SpaceMouse Plus XT to SpaceMouse Pro.
-_LOGITECH_PRODUCTS = range(0xC603, 0xC62C)
-_MULTI_AXIS = (1, 8)  # HID usage page and usage of a multi-axis controller
-_REPORT_BYTES = 64
-
-
-class SpaceMouseReports:
-    """The state of a device, from the reports that it sends when something changes."""
-
-    def __init__(self) -> None:
-        #: Six deflections in ±1: forward, left, up, and turns about these.
-        self.axes = [0.0] * 6
-        #: 1 for each that is pressed.
-        self.buttons = [0, 0]
-
-    def parse_report(self, report: bytes) -> bool:
-        """Parse a report; return whether it is about axes or buttons.
-
-        Older devices send translation and rotation one after the other, newer ones together.
-        """
-        if not report:
-            return False
-        kind, body = report[0], report[1:]
-        if kind == _TRANSLATION and len(body) >= 12:
-            self._deflect(0, struct.unpack_from("<6h", body))
-        elif kind in (_TRANSLATION, _ROTATION) and len(body) >= 6:
-            self._deflect(3 * (kind == _ROTATION), struct.unpack_from("<3h", body))
-        elif kind == _BUTTONS and body:
-            pressed = int.from_bytes(body, "little")
-            count = max(len(self.buttons), pressed.bit_length())
-            self.buttons = [pressed >> number & 1 for number in range(count)]
-        else:
-            return False
-        return True
-
-    def _deflect(self, first: int, raw: tuple[int, ...]) -> None:
-        for axis, source in enumerate(_ORDER):
-            if first <= source < first + len(raw):
-                value = -raw[source - first] / FULL_DEFLECTION
-                self.axes[axis] = max(-1.0, min(1.0, value)) + 0.0  # without a negative zero
-
-
-class SpaceMouse(SpaceMouseReports):
-    """The first SpaceMouse that is plugged in.
-
-    Raises:
-        TrackingError: none is there, it may not be opened, or hidapi is not installed.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        try:
-            import hid
-        except ImportError as error:
-            raise TrackingError(
-                f"a SpaceMouse needs the library hidapi ({error}): pip install "
-                f"'us_sim[space_mouse]'"
-            ) from error
-        found = [entry for entry in hid.enumerate() if _is_space_mouse(entry)]
-        if not found:
-            raise TrackingError("no SpaceMouse is plugged in: plug it in, or pair it")
-        # One device may show itself several times: as a controller, a keyboard, a battery.
-        found.sort(key=lambda entry: (entry["usage_page"], entry["usage"]) != _MULTI_AXIS)
-        self.name = found[0].get("product_string") or "SpaceMouse"
-        self._device = hid.device()
-        try:
-            self._device.open_path(found[0]["path"])
-        except OSError as error:
-            raise TrackingError(
-                f"{self.name} cannot be opened ({error}): give yourself access to its hidraw "
-                f"device (Linux: a udev rule for vendor {found[0]['vendor_id']:04x}), or end the "
-                f"program that uses it"
-            ) from error
-
-    def wait_for_report(self, seconds: float) -> bool:
-        """Wait for the next report; return whether one came and changed something.
-
-        Raises:
-            TrackingError: the device is gone.
-        """
-        try:
-            report = self._device.read(_REPORT_BYTES, max(round(seconds * 1e3), 1))
-        except (OSError, ValueError) as error:
-            raise TrackingError(f"{self.name} is gone ({error}): plug it in again") from error
-        return self.parse_report(bytes(report))
-
-    def close(self) -> None:
-        """Close the device."""
-        self._device.close()
-
-
-def _is_space_mouse(entry: dict[str, Any]) -> bool:
-    vendor, product = entry["vendor_id"], entry["product_id"]
-    return vendor == _3DCONNEXION or (vendor == _LOGITECH and product in _LOGITECH_PRODUCTS)
