@@ -19,9 +19,7 @@ from us_sim.recording.topic import BagMessage, BagTopic
 
 DEPTH = 10  # messages that publishers keep
 START_S = 0.5  # for subscribers to find the publishers before the first message
-_SHOWN = (
-    100_000_000  # ns of a recording that are published at once after a jump: one image at least
-)
+_SHOWN = 100_000_000  # ns of a recording that are published at once after a jump
 
 
 class SessionPlayer(RecordingPlayer):
