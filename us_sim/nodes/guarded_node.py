@@ -143,7 +143,7 @@ class GuardedNode(Node):
             self.get_logger().debug("".join(traceback.format_exception(error)))
 
     def is_log_due(self, kind: str) -> bool:
-        """Return whether to log a problem of this kind now; one that goes on is logged rarely."""
+        """Return whether to log a problem of this kind now; it is logged ever more rarely."""
         now = time.monotonic()
         due, wait = self._due.get(kind, (now, REPEAT_S))
         if now < due:

@@ -186,7 +186,7 @@ class SessionRecorder(GuardedNode):
             self._latched[topic] = message
 
     def _time_of_arrival(self, info: Mapping[str, Any]) -> int:
-        """Return the ns at which the middleware had a message, before a starving recorder had."""
+        """Return the time (ns) at which the middleware got a message; a busy recorder is later."""
         clock: Any = self.get_clock()
         received: int = info.get("received_timestamp") or 0
         is_known = received > 0 and not clock.ros_time_is_active  # which is another clock's

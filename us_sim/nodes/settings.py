@@ -39,7 +39,7 @@ _AGE = Quantity("time", 0.01, 3600.0)
 
 @dataclass(frozen=True)
 class AnnotatedImageSettings(Settings):
-    """Of ``slice_interpolator``: the contents of the annotated image, and when its pose is old."""
+    """Parameters of ``slice_interpolator`` for the annotated image, and for the age of its pose."""
 
     live = True
 
@@ -78,7 +78,7 @@ OF_SIMULATORS = tuple(f"/{topic.name}" for topic in TOPICS if not topic.is_from_
 
 @dataclass(frozen=True)
 class PlayerSettings(Settings):
-    """Of nodes that play: what ``ros2 bag play`` has under the same names, and more."""
+    """Parameters of players: what ``ros2 bag play`` has under the same names, and more."""
 
     path: str | None = setting(
         description="bag to play; `path_player` takes tracker recordings, too",
@@ -108,7 +108,7 @@ class PlayerSettings(Settings):
 
 @dataclass(frozen=True)
 class PathPlayerSettings(PlayerSettings):
-    """Of ``path_player``."""
+    """Parameters of ``path_player``."""
 
     topic: str | None = setting(
         description="in the bag; not given: the only one of PoseStamped", default=None
@@ -132,14 +132,14 @@ class PathPlayerSettings(PlayerSettings):
 
 @dataclass(frozen=True)
 class SessionPlayerSettings(PlayerSettings):
-    """Of ``session_player``."""
+    """Parameters of ``session_player``."""
 
     exclude: tuple[str, ...] = setting(description="topics to leave out", default=())
 
 
 @dataclass(frozen=True)
 class SessionRecorderSettings(Settings):
-    """Of ``session_recorder``."""
+    """Parameters of ``session_recorder``."""
 
     file: str = setting(
         description="MCAP file to write, or a new folder for a bag", default="session.mcap"
@@ -211,7 +211,7 @@ class SessionRecorderSettings(Settings):
 
 @dataclass(frozen=True)
 class SessionControlSettings(Settings):
-    """Of ``session_control``."""
+    """Parameters of ``session_control``."""
 
     live = True
 
@@ -250,7 +250,7 @@ _MARKERS = Quantity("frequency", 0.1, 1000.0)
 
 @dataclass(frozen=True)
 class SceneNodeSettings(Settings):
-    """Of every node that works on a scene."""
+    """Parameters of every node that works on a scene."""
 
     scene: str = setting(description="scene file, or name of an installed one", default="upper_arm")
     volume: str | None = setting(
@@ -268,7 +268,7 @@ class SceneNodeSettings(Settings):
 
 @dataclass(frozen=True)
 class ProbeTrackerSettings(Settings):
-    """Of ``probe_tracker``."""
+    """Parameters of ``probe_tracker``."""
 
     source: str | None = setting(
         description="replaces tracker.source of the scene", choice=TRACKERS, default=None
@@ -283,7 +283,7 @@ class ProbeTrackerSettings(Settings):
 
 @dataclass(frozen=True)
 class TissueDeformerSettings(Settings):
-    """Of ``tissue_deformer``, beside those of the solvers and of the materials."""
+    """Parameters of ``tissue_deformer``, beside those of the solvers and of the materials."""
 
     live = True
 
@@ -306,7 +306,7 @@ class TissueDeformerSettings(Settings):
 
 @dataclass(frozen=True)
 class StructureMarkersSettings(Settings):
-    """Of ``tissue_deformer`` where the scene has structures."""
+    """Parameters of ``tissue_deformer`` where the scene has structures."""
 
     marker_rate: float = setting(
         _MARKERS, "markers of the structures are sent at most", default=20.0, live=True
@@ -320,7 +320,7 @@ class StructureMarkersSettings(Settings):
 
 @dataclass(frozen=True)
 class SkinDeformerSettings(Settings):
-    """Of ``skin_deformer``."""
+    """Parameters of ``skin_deformer``."""
 
     marker_rate: float = setting(_MARKERS, "markers are sent at most", default=20.0, live=True)
     marker_opacity: float = setting(
@@ -333,7 +333,7 @@ class SkinDeformerSettings(Settings):
 
 @dataclass(frozen=True)
 class ImageWriterSettings(Settings):
-    """Of ``image_writer``."""
+    """Parameters of ``image_writer``."""
 
     folder: str = setting(description="where the PNG files go", default="images")
     labels: str | None = setting(
@@ -349,7 +349,7 @@ class ImageWriterSettings(Settings):
 
 @dataclass(frozen=True)
 class CameraDriverSettings(Settings):
-    """Of ``camera_driver``."""
+    """Parameters of ``camera_driver``."""
 
     source: str = setting(
         description="camera's number, a stream's address or a video file", default="0"
@@ -374,7 +374,7 @@ class CameraDriverSettings(Settings):
 
 @dataclass(frozen=True)
 class OpenIGTLinkBridgeSettings(Settings):
-    """Of ``openigtlink_bridge``."""
+    """Parameters of ``openigtlink_bridge``."""
 
     host: str | None = setting(
         description="address to listen at; none: all of this computer", default="localhost"
@@ -391,7 +391,7 @@ class OpenIGTLinkBridgeSettings(Settings):
 
 @dataclass(frozen=True)
 class ScorerSettings(Settings):
-    """Of ``scorer``."""
+    """Parameters of ``scorer``."""
 
     exercise: str | None = setting(
         description="file of an exercise, or name of an installed one, in place of the scene's",

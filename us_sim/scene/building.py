@@ -489,7 +489,7 @@ def build_structures(
 
 
 def build_blood(scene: Scene, volume: Volume) -> Blood:
-    """Build the vessels of the scene that have a flow; refuse one that is no tube, or crossed."""
+    """Build the scene's vessels with a flow; one that is no tube along its flow is refused."""
     from us_sim.slicing.flow.blood import Blood
     from us_sim.slicing.flow.vessel import Vessel
 

@@ -94,7 +94,7 @@ class StructureSettings(Settings):
     )
 
     def check(self) -> None:
-        """Require a label or a file, and settings that go with it."""
+        """Refuse keys that do not go together."""
         if self.file and self.flow:
             raise self.make_error(
                 "flow", "is for structures around a label, in which there is room for blood"
