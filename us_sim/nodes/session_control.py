@@ -51,8 +51,8 @@ class SessionControl(GuardedNode):
         self.health = Health(self, "")
         self._scenes = self.create_latched_publisher(DiagnosticArray, "session/scenes")
         self._bags = self.create_latched_publisher(DiagnosticArray, "session/bags")
-        self.add_on_set_parameters_callback(self._check)
-        self.add_post_set_parameters_callback(self._take)
+        self.add_on_set_parameters_callback(self._check_parameters)
+        self.add_post_set_parameters_callback(self._apply_parameters)
         self.set_state_parameters(settings)
 
     def set_state_parameters(self, settings: SessionControlSettings) -> None:
@@ -126,7 +126,7 @@ class SessionControl(GuardedNode):
             parameters = [*parameters, Parameter("volume", value="")]
         return settings_with(self.values, parameters)
 
-    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+    def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         if self._is_showing:
             return SetParametersResult(successful=True)
         try:
@@ -136,7 +136,7 @@ class SessionControl(GuardedNode):
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def _take(self, parameters: list[Parameter]) -> None:
+    def _apply_parameters(self, parameters: list[Parameter]) -> None:
         if self._is_showing:
             self.values = settings_with(self.values, parameters)
             return

@@ -162,7 +162,7 @@ class SessionRecorder(GuardedNode):
         offered = self._offered(topic, type_name)
         if not offered:
             return
-        recorded = RecordedTopic(self, topic, type_name, offered, self._take, self._lost)
+        recorded = RecordedTopic(self, topic, type_name, offered, self._on_message, self._on_loss)
         if self._bag is not None:
             self._bag.add_topic(topic, type_name, offered)
         self._topics[topic] = recorded
@@ -172,7 +172,7 @@ class SessionRecorder(GuardedNode):
         publishers = self.get_publishers_info_by_topic(topic)
         return [qos_of(each.qos_profile) for each in publishers if each.topic_type == type_name]
 
-    def _take(self, topic: str, data: bytes, info: Mapping[str, Any]) -> None:
+    def _on_message(self, topic: str, data: bytes, info: Mapping[str, Any]) -> None:
         self.health.received += 1
         now = self._time_of_arrival(info)
         sent = info["source_timestamp"]
@@ -192,7 +192,7 @@ class SessionRecorder(GuardedNode):
         is_known = received > 0 and not clock.ros_time_is_active  # which is another clock's
         return received if is_known else int(clock.now().nanoseconds)
 
-    def _lost(self, topic: str, count: int) -> None:
+    def _on_loss(self, topic: str, count: int) -> None:
         if self._bag is not None and not self._settings.paused:
             self._bag.count_lost(topic, count)
 
