@@ -173,8 +173,7 @@ class TissueDeformer(SceneNode):
         self._wrench = self.create_stream_publisher(WrenchStamped, "probe/wrench")
         self._contact = None
         if scene.tracker.source.name == "haptic":
-            contact_model = self.create_stream_publisher(Float64MultiArray, "tissue/contact_model")
-            self._contact = contact_model
+            self._contact = self.create_stream_publisher(Float64MultiArray, "tissue/contact_model")
         rest = self.create_latched_publisher(PointCloud2, "tissue/rest")
         tetrahedra = self.create_latched_publisher(Int32MultiArray, "tissue/tetrahedra")
         rest.publish(self._cloud(mesh.nodes, ALWAYS))
