@@ -183,7 +183,8 @@ def _nodes() -> Iterator[Section]:
                 )
             elif each is not SceneNodeSettings:
                 about = extract_summary(each.__doc__)
-                text += [about] * (about != f"Of `{node}`.") + [_parameters(each)]
+                is_more = not about.lower().endswith(f"of `{node}`.")  # than whose they are
+                text += [about] * is_more + [_parameters(each)]
         if node in _OF_THE_SCENE:
             keys = _OF_THE_SCENE[node].items()
             links = ", ".join(f"{key} of [{title}](#{make_anchor(title)})" for key, title in keys)
