@@ -37,7 +37,7 @@ from us_sim.cache import cache_folder
 njit: Any = partial(numba.njit, no_cfunc_wrapper=True)
 
 
-def enable_kernel_cache() -> Path:
+def enable_kernel_cache() -> None:
     """Have numba keep what it compiles in these sources' folder; remove old ones of others."""
     place = Path(getattr(config, "CACHE_DIR", "") or cache_folder() / "kernels")
     sources = b"".join(map(Path.read_bytes, find_kernel_sources()))
@@ -58,7 +58,6 @@ def enable_kernel_cache() -> Path:
             if time.time() - os.path.getmtime(folder) > 86400.0:  # else it may be in use
                 shutil.rmtree(folder, ignore_errors=True)
     config.CACHE_DIR = str(place / name)  # type: ignore[attr-defined]
-    return place / name
 
 
 def find_kernel_sources() -> list[Path]:

@@ -29,6 +29,7 @@ from us_sim.recording.decoding import nanoseconds_of
 T = TypeVar("T")
 CLOCK_S = 5.0  # for simulated time to begin, before it is said that it does not
 FAILED = "it failed; see the node's log"
+ANOTHER_CLOCK_S = 10.0  # between the present and a stamp, from which on it is of another clock
 LONGEST = 500  # characters of a sentence: an error may quote all of a message
 REPEAT_S, SAY_AT_LEAST_S = 5.0, 300.0
 """Time until a problem is logged again: at first, then twice as long each time, and at most."""
@@ -305,9 +306,6 @@ def _name(callback: Any) -> str:
 def loggable_text(sentence: str) -> str:
     """Return a sentence, which may quote a message, on one line of limited length."""
     return printable_line(" ".join(sentence[: LONGEST + 1].split()), LONGEST)
-
-
-ANOTHER_CLOCK_S = 10.0  # between the present and a stamp, from which on it is of another clock
 
 
 class Health:

@@ -22,6 +22,7 @@ from us_sim.recording.decoding import nanoseconds_of, pose_from
 from us_sim.scene.building import build_haptic_rendering, source_settings
 
 _MEASURED = 2000  # ticks, of which the jitter is measured
+CHECKS = 5.0  # a second, of who listens
 
 
 class PeriodicThread:
@@ -65,9 +66,6 @@ class PeriodicThread:
                 due += passed * self._period
             self._work(time.monotonic_ns())
             self._late.append(time.monotonic_ns() - due)
-
-
-CHECKS = 5.0  # a second, of who listens
 
 
 class HapticRenderer(SceneNode):

@@ -28,6 +28,13 @@ from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.settings import TISSUE_PARAMETERS, Imaging
 
+_BEYOND = 1e-3  # m, by which an image may be too deep without a report
+_NONE, _POOR = 0.02, 0.5  # coupling, averaged over the face, below which contact is none or poor
+_SEEN = ("contact", "no_colour", "no_spectrum")
+"""Diagnostics that are sent at once when they change: the reasons of an empty image."""
+REMEMBERED = 256  # poses kept for the deformed nodes that carry their stamps
+SKINS_REMEMBERED = 64
+
 
 def _together(values: dict[str, Any]) -> tuple[Probe, Imaging, Acoustics]:
     tissues = {
@@ -37,16 +44,6 @@ def _together(values: dict[str, Any]) -> tuple[Probe, Imaging, Acoustics]:
     }
     acoustics = dataclasses.replace(values["acoustics."], tissues=tissues)
     return values["probe"], values["imaging"], acoustics
-
-
-_BEYOND = 1e-3  # m, by which an image may be too deep without a report
-
-_NONE, _POOR = 0.02, 0.5  # coupling, averaged over the face, below which contact is none or poor
-_SEEN = ("contact", "no_colour", "no_spectrum")
-"""Diagnostics that are sent at once when they change: the reasons of an empty image."""
-
-REMEMBERED = 256  # poses kept for the deformed nodes that carry their stamps
-SKINS_REMEMBERED = 64
 
 
 class SliceInterpolator(SceneNode):

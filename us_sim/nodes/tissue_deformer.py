@@ -52,6 +52,11 @@ from us_sim.tracking.haptic import ContactModel, rotate_to_patient
 
 OWN = "tissue_deformer"
 STRUCTURES = "tissue/structures"
+ALWAYS = TimeMessage()  # the stamp of what does not change: zero, which tf takes as the latest
+GO_ON_S = 0.05
+"""Time without a pose after which an unfinished frame is continued. It is longer than a frame: an
+executor serves timers before messages."""
+VISIBLE_M = 5e-5  # by which a node must have moved for a continued frame to be published again
 PREPARED_CHECK_S = 0.1  # between checks for a method that has been prepared
 _MATERIALS = "materials."
 
@@ -128,13 +133,6 @@ class StructureMarkers:
         self._node.get_logger().info(
             f"made the surfaces of {self.state}, in {time.monotonic() - began:.1f} s"
         )
-
-
-ALWAYS = TimeMessage()  # the stamp of what does not change: zero, which tf takes as the latest
-GO_ON_S = 0.05
-"""Time without a pose after which an unfinished frame is continued. It is longer than a frame: an
-executor serves timers before messages."""
-VISIBLE_M = 5e-5  # by which a node must have moved for a continued frame to be published again
 
 
 class TissueDeformer(SceneNode):

@@ -29,6 +29,10 @@ from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.sweep import TrackedSweep
 from us_sim.volume.volume import Volume
 
+_POSES = 60  # of a path that are tried
+_POINTS = 32  # along each side of an image
+_LITTLE = 0.002
+"""Part of the best image of a path that is of the volume, below which the path is refused."""
 _MOST_FRAMES = 60
 """Frames of a solver until the tissue under one pose is at rest; inertia and creep take some."""
 
@@ -106,13 +110,6 @@ class RestPlacement:
             if self.solver.is_settled:
                 break
         return np.asarray(deformation.nodes, dtype=np.float64)
-
-
-_POSES = 60  # of a path that are tried
-_POINTS = 32  # along each side of an image
-
-_LITTLE = 0.002
-"""Part of the best image of a path that is of the volume, below which the path is refused."""
 
 
 def compute_part_inside(

@@ -26,7 +26,9 @@ from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.settings import OVERLAYS
 
+CHECKS = 5.0  # a second, of the age of the newest pose
 _TOPIC = "ultrasound/image_annotated"
+_AMBER, _RED, _GREY = (255, 176, 0), (235, 45, 45), (150, 150, 150)
 
 
 class MessageAge:
@@ -54,10 +56,6 @@ class MessageAge:
         ros, real = self._came
         now = self._node.get_clock().now().nanoseconds
         return 1e-9 * min(now - ros, time.monotonic_ns() - real)
-
-
-CHECKS = 5.0  # a second, of the age of the newest pose
-_AMBER, _RED, _GREY = (255, 176, 0), (235, 45, 45), (150, 150, 150)
 
 
 class AnnotatedImage:
