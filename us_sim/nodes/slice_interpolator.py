@@ -163,8 +163,9 @@ class SliceInterpolator(SceneNode):
 
     def _image_unpaired(self) -> None:
         """Make the image of waiting nodes if their pose has come."""
-        if self._unpaired and nanoseconds_of(self._unpaired.header.stamp) in self._poses:
-            self._on_nodes(self._unpaired)
+        nodes = self._unpaired
+        if nodes is not None and nanoseconds_of(nodes.header.stamp) in self._poses:
+            self._on_nodes(nodes)
 
     def _on_nodes(self, message: PointCloud2) -> None:
         stamp = nanoseconds_of(message.header.stamp)

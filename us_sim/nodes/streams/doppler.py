@@ -93,10 +93,10 @@ def _colour_streams(node: SceneNode, blood: Blood) -> list[FrameStream]:
     def exact(frame: Frame) -> NDArray[np.float32]:
         return colour.for_frame(frame).compute_true_velocity(blood, frame)
 
-    topic, prepare = "ultrasound/velocity", colour.prepare_for_probe
+    topic, prepare = "ultrasound/velocity_estimate", colour.prepare_for_probe
     return [
-        FrameStream(node, topic, exact),
-        FrameStream(node, f"{topic}_estimate", estimate, prepare=prepare, overlay=overlay),
+        FrameStream(node, "ultrasound/velocity", exact),
+        FrameStream(node, topic, estimate, prepare=prepare, overlay=overlay),
     ]
 
 
