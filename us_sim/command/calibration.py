@@ -21,23 +21,10 @@ from us_sim.command.calibration_settings import (
 )
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
-from us_sim.recording.path import (
-    ProbePath,
-    is_tracker_recording,
-    read_path,
-    read_tracker_recording,
-)
+from us_sim.recording.path import ProbePath, is_tracker_recording, read_path, read_tracker_recording
 from us_sim.settings.spelling import format_count
-from us_sim.tracking.calibration.camera import (
-    INTRINSICS,
-    BoardView,
-    calibrate_camera,
-    find_board,
-)
-from us_sim.tracking.calibration.landmarks import (
-    read_landmarks,
-    register_landmarks,
-)
+from us_sim.tracking.calibration.camera import INTRINSICS, BoardView, calibrate_camera, find_board
+from us_sim.tracking.calibration.landmarks import read_landmarks, register_landmarks
 from us_sim.tracking.calibration.pivot import calibrate_pivot, find_dwells
 from us_sim.tracking.calibration.time_offset import (
     PositionSignal,
@@ -157,8 +144,10 @@ def calibrate_photos(settings: CameraCalibrationSettings, progress: Progress | N
         f"{intrinsic} {found.camera.matrix[k, k]:.1f} ± {found.deviations[k]:.1f}"
         for k, intrinsic in enumerate(INTRINSICS[:2])
     )
-    said = f"{out}: {focal} pixels, RMS {found.rms:.3f} pixels in {format_count(len(views), 'photo')}, "
-    said += f"corners up to {100 * found.reach:.0f} % of the way to the image's"
+    said = (
+        f"{out}: {focal} pixels, RMS {found.rms:.3f} pixels in {format_count(len(views), 'photo')}"
+        f", corners up to {100 * found.reach:.0f} % of the way to the image's"
+    )
     if blank:
         said += f"; {len(blank)} without the board: {', '.join(blank)}"
     if far_off:

@@ -36,9 +36,7 @@ class PressSettings(Settings):
 
     force: float = setting(Quantity("force", 1e-6, 1e4), "with which the probe pushes", default=5.0)
     at: tuple[float, float] = setting(
-        Quantity("length", -1.0, 1.0),
-        "place of the probe: x, y in `patient`",
-        default=(0.0, 0.0),
+        Quantity("length", -1.0, 1.0), "place of the probe: x, y in `patient`", default=(0.0, 0.0)
     )
     step: float = setting(
         Quantity("length", 1e-5, 0.1), "between the poses on the way", default=1e-3
@@ -87,12 +85,7 @@ def _press(args: argparse.Namespace) -> int:
     start = Pose(np.array([*settings.at, 0.0]))
     show = late_progress(f"pressing with {settings.force:g} N")
     curve = press_to_force(
-        solver,
-        settings.force,
-        start,
-        step=settings.step,
-        deepest=settings.deepest,
-        progress=show,
+        solver, settings.force, start, step=settings.step, deepest=settings.deepest, progress=show
     )
     show(1.0, f"{1e3 * curve[-1].depth:.2f} mm deep")
     fractions, names = compute_label_fractions(model.mesh, volume), volume.label_names

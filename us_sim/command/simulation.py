@@ -244,9 +244,5 @@ def _play(args: argparse.Namespace) -> int:
     player = read_settings(args, PlayerSettings, (*_OF_THE_PLAYER, "clock"))
     prepare_ros(network=args.network)
     return play_bag(
-        args.bag,
-        player,
-        topic=args.topic,
-        everything=args.everything,
-        lockstep=args.lockstep,
+        args.bag, player, topic=args.topic, everything=args.everything, lockstep=args.lockstep
     )

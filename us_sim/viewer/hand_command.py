@@ -1,8 +1,8 @@
 """What a page asks of the hand that holds the probe.
 
->>> from us_sim.tracking.virtual_hand import RestSurface, Stance
+>>> from us_sim.tracking.virtual_hand import Stance, StandingSurface
 >>> asked = HandCommand.read({"source": "a", "sequence": 7, "to": {"press": 0.004}})
->>> asked = asked.change_stance(Stance(rotation=0.1), RestSurface.plane(0.1))
+>>> asked = asked.change_stance(Stance(rotation=0.1), StandingSurface.create_plane(0.1))
 >>> asked.press, asked.rotation
 (0.004, 0.1)
 """

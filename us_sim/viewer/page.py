@@ -226,13 +226,11 @@ def _absent(what: str, why: str, values: Mapping[str, str]) -> str:
 def describe_scene(state: SessionState) -> tuple[str, str]:
     """The scene's name and a remark on it, which is often empty.
 
-    >>> describe_scene(SessionState(is_there=True, scene="upper_arm", state="running"))
-    ('upper arm', '')
-    >>> describe_scene(SessionState(is_there=True, scene="upper_arm", state="starting", fraction=0.4))
+    >>> describe_scene(SessionState(scene="upper_arm", state="starting", fraction=0.4))
     ('upper arm', 'starting, 40 %')
     >>> replay = {"replay": "/home/a/press.mcap", "replay_state": "finished"}
     >>> record = {"record": "/home/a/b.mcap", "record_state": "recording"}
-    >>> describe_scene(SessionState(is_there=True, scene="upper_arm", **record, **replay))
+    >>> describe_scene(SessionState(scene="upper_arm", **record, **replay))
     ('upper arm', 'recording b.mcap · replay of press.mcap: finished')
     """
     name = state.scene.replace("_", " ")

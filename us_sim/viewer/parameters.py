@@ -1,11 +1,9 @@
 """A parameter of a node as a page shows it: in the unit a person reads, with range and meaning.
 
 >>> from us_sim.viewer.parameters import ParameterKind, Parameter
->>> depth = Parameter(
-...     "slice_interpolator", "depth", ParameterKind.NUMBER, 0.04, unit="mm", size=1e-3, limits=(0.005, 0.4)
-... )
->>> depth.value, depth.low, depth.high, depth.convert_to_raw(45)
-(40.0, 5.0, 400.0, 0.045)
+>>> depth = Parameter("slice_interpolator", "depth", ParameterKind.NUMBER, 0.04, "mm", size=1e-3)
+>>> depth.value, depth.convert_to_raw(45)
+(40.0, 0.045)
 """
 
 from __future__ import annotations

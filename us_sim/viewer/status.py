@@ -2,9 +2,10 @@
 
 >>> from us_sim.viewer.status import NodeLevel, NodeStatus, StatusBoard
 >>> board = StatusBoard()
->>> board.add_report(NodeStatus("tissue_deformer", NodeLevel.WELL, "fem", {"rate_hz": "59.9"}), now=10.0)
+>>> status = NodeStatus("tissue_deformer", NodeLevel.WELL, "fem", {"rate_hz": "59.9"})
+>>> board.add_report(status, now=10.0)
 >>> board.list_nodes(now=11.0)[0].read_number("rate_hz"), board.list_nodes(now=15.0)[0].level
-(59.9, <Level.GONE: 'gone'>)
+(59.9, <NodeLevel.GONE: 'gone'>)
 """
 
 from __future__ import annotations

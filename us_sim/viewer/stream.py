@@ -6,7 +6,7 @@
 (0, True)
 >>> feed = Feed("image", lambda watched: print("watched" if watched else "left"))
 >>> told = []
->>> feed.watch(lambda: told.append(feed.sequence))
+>>> feed.add_watcher(lambda: told.append(feed.sequence))
 watched
 >>> feed.offer_packet(lambda sequence: Packet("image", sequence, {}, b"first"))
 >>> feed.offer_packet(lambda sequence: Packet("image", sequence, {}, b"second"))

@@ -183,10 +183,7 @@ class CarriedSurfaces:
     """
 
     def __init__(
-        self,
-        mesh: TetrahedralMesh,
-        surfaces: Sequence[ColouredSurface],
-        triangles: int = 20_000,
+        self, mesh: TetrahedralMesh, surfaces: Sequence[ColouredSurface], triangles: int = 20_000
     ) -> None:
         from us_sim.tissue.mesh.embedding import locate_points  # with its kernels
 
@@ -239,10 +236,7 @@ class CarriedSurfaces:
 
 
 def make_transducer_packet(
-    kind: str,
-    sequence: int,
-    parts: Sequence[ColouredSurface],
-    outline: NDArray[np.floating],
+    kind: str, sequence: int, parts: Sequence[ColouredSurface], outline: NDArray[np.floating]
 ) -> Packet:
     """Vertices as float32 and triangles as uint32 of each part, then the outline as float32.
 

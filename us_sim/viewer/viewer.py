@@ -44,16 +44,11 @@ class Viewer(GuardedNode):
         post = CallPoster(self)
         folder = os.path.abspath(os.path.expanduser(settings.recordings or ""))
         self._session = ViewerSession(
-            self,
-            post,
-            folder if settings.recordings else "",
-            is_own=is_loopback(settings.host),
+            self, post, folder if settings.recordings else "", is_own=is_loopback(settings.host)
         )
         self._remote = RemoteParameters(self, {CONTROL: self._session.ask_control})
         self.simulator = Simulator(
-            nodes=self._remote,
-            status=StatusListener(self, post),
-            session=self._session,
+            nodes=self._remote, status=StatusListener(self, post), session=self._session
         )
         connect_scorer(self, post, self.simulator)
         rest = RestMeshListener(self)

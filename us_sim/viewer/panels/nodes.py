@@ -22,16 +22,7 @@ from us_sim.viewer.parameters import Parameter
 from us_sim.viewer.status import HISTORY_S, NodeLevel, NodeStatus, Point
 from us_sim.viewer.stream import Simulator
 
-COMMON = (
-    "depth",
-    "gain",
-    "dynamic_range",
-    "focus",
-    "time_gain",
-    "grey_map",
-    "overlay",
-    "contact",
-)
+COMMON = ("depth", "gain", "dynamic_range", "focus", "time_gain", "grey_map", "overlay", "contact")
 """Parameters of ``slice_interpolator`` that stand first."""
 STATUS_S = 0.5  # how often states are brought up to date
 TISSUE = "tissue_deformer"

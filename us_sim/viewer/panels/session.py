@@ -334,10 +334,9 @@ class SessionPanel:
 def describe_recording(state: SessionState) -> tuple[str, bool]:
     """How long, how large, and how much longer it may become; and whether that is little.
 
-    >>> describe_recording(SessionState(record_seconds=72.0, record_bytes=3.6e8, record_room_bytes=9e9))
+    >>> state = SessionState(record_seconds=72.0, record_bytes=3.6e8, record_room_bytes=9e9)
+    >>> describe_recording(state)
     (': 1:12 min, 360 MB, room for 30 min', False)
-    >>> describe_recording(SessionState(record_seconds=10.0, record_bytes=1e9, record_room_bytes=5e9))
-    (': 0:10 min, 1.0 GB, room for 1 min', True)
     """
     seconds, size, room = state.record_seconds, state.record_bytes, state.record_room_bytes
     if not room:
