@@ -203,18 +203,17 @@ def test_nothing_is_watched_that_cannot_be_seen(page: Any, node: Node) -> None:
     until(lambda: node.nodes.watched == set(), "the page has gone")
 
 
-def test_status_and_plots(page: Any, simulator: Simulator, node: Node) -> None:
+def test_status(page: Any, simulator: Simulator, node: Node) -> None:
     board = simulator.status
     values = {"state": "fem", "rate_hz": "59.9", "latency_p50_ms": "7.04", "latency_p99_ms": "120"}
     values |= {"received": "300", "dropped": "3", "residual": "1e-3"}
     opened(page, "Status")
-    until(lambda: board.is_watched and board.force.is_watched, "status and plots are seen")
+    until(lambda: board.is_watched, "the status is seen")
 
     def tell() -> None:
         now = time.monotonic()
         board.add_report(NodeStatus("tissue_deformer", NodeLevel.WELL, "fem", values), now)
         board.add_report(NodeStatus("probe_tracker", NodeLevel.ERROR, "the probe is lost", {}), now)
-        board.add_force(4.25, now - 1.0)
 
     def rows() -> list[str]:
         tell()
@@ -225,20 +224,10 @@ def test_status_and_plots(page: Any, simulator: Simulator, node: Node) -> None:
     until(lambda: len(rows()) == 2, "two nodes are told")
     assert rows()[1].strip() == "tissue_deformer fem 59.9 7.0 · 120 300 3"
     assert "the probe is lost" in rows()[0]
-    plot = page.get_by_role("img", name=re.compile("^contact force"))
-
-    def is_drawn() -> bool:
-        tell()
-        return "probe 4.25 N" in (plot.get_attribute("aria-label") or "")
-
-    until(is_drawn, "the force is drawn")
     page.get_by_role("button", name="tissue_deformer").click()
     page.get_by_role("dialog").wait_for()
     until(lambda: "tissue_deformer" in node.nodes.watched, "the dialog shows its parameters")
     page.keyboard.press("Escape")
     until(lambda: "tissue_deformer" not in node.nodes.watched, "the dialog is closed")
-    page.get_by_role("tab", name="Image").click()
-    until(lambda: not board.force.is_watched, "nobody looks at the plots any more")
-    assert board.is_watched  # the image says what its node says of it
     page.goto("about:blank")
     until(lambda: not board.is_watched, "nobody looks any more")

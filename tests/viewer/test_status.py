@@ -1,14 +1,12 @@
-"""The state of nodes for pages: newest status, problems, silence, and bounded histories.
+"""The state of nodes for pages: newest status, problems and silence.
 
 The status board fed by real messages, only while somebody looks.
 """
 
-import math
 import time
 from time import monotonic as now
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import WrenchStamped
 
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.viewer.status import GONE_S, NodeLevel, NodeStatus, StatusBoard, StatusListener
@@ -79,49 +77,22 @@ def test_nobody_is_silent_who_was_not_listened_to():
     assert [s.level for s in board.list_nodes(begun + GONE_S + 0.5)] == [NodeLevel.GONE]
 
 
-def test_histories_are_of_the_numbers_that_are_plotted_and_bounded():
-    board = StatusBoard()
-    for second in range(300):
-        board.add_report(said(rate_hz=str(second)), now=float(second))
-    history = board.get_history("rate_hz", since=240.0)["tissue_deformer"]
-    assert history == [(float(s), float(s)) for s in range(241, 300)]
-    assert len(board.get_history("rate_hz", since=0.0)["tissue_deformer"]) == 100
-    assert board.get_history("residual", since=0.0) == {}
-    assert board.get_history("received", since=0.0) == {}
-
-
-def test_of_the_forces_within_a_tenth_of_a_second_the_largest_is_kept():
-    board = StatusBoard()
-    for i in range(120):  # 60 a second, for 2 s
-        board.add_force(float(i % 6), now=i / 60)
-    forces = board.get_forces(since=-1.0)
-    assert 18 <= len(forces) <= 20
-    assert {force for _, force in forces[:-1]} == {5.0}
-    assert board.get_forces(since=1.0) == [each for each in forces if each[0] > 1.0]
-    for i in range(10_000):
-        board.add_force(1.0, now=10.0 + i)
-    assert len(board.get_forces(since=0.0)) == 600
-
-
 def test_only_the_first_who_looks_and_the_last_who_goes_are_told():
-    told: list[tuple[bool, bool]] = []
-    board = StatusBoard(lambda: told.append((board.is_watched, board.force.is_watched)))
+    told: list[bool] = []
+    board = StatusBoard(lambda: told.append(board.is_watched))
     board.add_page()
     board.add_page()
-    board.force.add_page()
     board.remove_page()
-    board.force.remove_page()
     board.remove_page()
-    assert told == [(True, False), (True, True), (True, False), (False, False)]
+    assert told == [True, False]
 
 
-def test_nodes_and_the_force_are_heard_while_somebody_looks(bench):
+def test_nodes_are_heard_while_somebody_looks(bench):
     listening = bench.add(GuardedNode("viewer", context=bench.context))
     listener = StatusListener(listening, CallPoster(listening))
     board = listener
     node = bench.add(GuardedNode("tissue_deformer", context=bench.context))
     node.health = Health(node, "arm")
-    wrenches = bench.peer.create_publisher(WrenchStamped, "probe/wrench", 10)
     bench.spin_for(5)
     assert bench.peer.count_subscribers("diagnostics") == 0
     board.add_page()
@@ -143,17 +114,6 @@ def test_nodes_and_the_force_are_heard_while_somebody_looks(bench):
         return board.find_node("tissue_deformer", now()).problem == "the pose is nonsense"
 
     bench.spin_until(warned)
-    assert bench.peer.count_subscribers("probe/wrench") == 0
-
-    board.force.add_page()
-    bench.spin_until(lambda: wrenches.get_subscription_count() == 1)
-    message = WrenchStamped()
-    message.wrench.force.x, message.wrench.force.z = 3.0, -4.0
-    message.header.stamp.sec = 1
-    wrenches.publish(message)
-    bench.spin_until(lambda: board.get_forces(since=0.0))
-    assert math.isclose(board.get_forces(since=0.0)[0][1], 5.0)
-
     foreign = bench.peer.create_publisher(DiagnosticArray, "diagnostics", 10)
     status = DiagnosticStatus(name="camera: lens", level=DiagnosticStatus.ERROR, message="dirty")
     bench.spin_until(lambda: foreign.get_subscription_count() == 1)
@@ -162,6 +122,4 @@ def test_nodes_and_the_force_are_heard_while_somebody_looks(bench):
     assert board.find_node("camera: lens", now()).level is NodeLevel.ERROR
 
     board.remove_page()
-    board.force.remove_page()
     bench.spin_until(lambda: bench.peer.count_subscribers("diagnostics") == 0)
-    assert wrenches.get_subscription_count() == 0

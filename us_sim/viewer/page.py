@@ -22,7 +22,7 @@ from us_sim.slicing.settings import OVERLAYS, STRIPS
 from us_sim.viewer.export import LARGEST, decode_frames, export_frames
 from us_sim.viewer.panels.asking import find_refusal, is_taken, set_parameter
 from us_sim.viewer.panels.exercise import ExercisePanel
-from us_sim.viewer.panels.nodes import TISSUE, build_image, build_plots, build_status, build_tissue
+from us_sim.viewer.panels.nodes import TISSUE, build_image, build_status, build_tissue
 from us_sim.viewer.panels.session import CasesPanel, SessionPanel
 from us_sim.viewer.parameters import ParameterKind
 from us_sim.viewer.remote_parameters import NodeParameters
@@ -284,11 +284,6 @@ _HEAD = """<link rel="stylesheet" href="/us_sim/assets/viewer.css">
 <link rel="stylesheet" href="/us_sim/assets/session.css">"""
 
 
-def _status(simulator: Simulator) -> None:
-    build_status(simulator)
-    build_plots(simulator)
-
-
 TISSUE_TAB = "Tissue"
 PANELS = [
     ("Image", "contrast", "The scanner's console: depth, gain, focus and more", build_image),
@@ -296,7 +291,7 @@ PANELS = [
     ("Cases", "collections", "Scenes and cases to load", CasesPanel),
     ("Session", "radio_button_checked", "Record, and replay recordings", SessionPanel),
     ("Exercise", "school", "A task, what is done of it, and the score", ExercisePanel),
-    ("Status", "monitor_heart", "How every node is, and plots of the last minute", _status),
+    ("Status", "monitor_heart", "How every node is", build_status),
 ]
 """Name, icon of Material's, title, and the function that fills the tab."""
 

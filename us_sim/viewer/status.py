@@ -1,4 +1,4 @@
-"""The state that every node last reported, and how some of its numbers went over a minute.
+"""The status that every node last reported.
 
 >>> from us_sim.viewer.status import NodeLevel, NodeStatus, StatusBoard
 >>> board = StatusBoard()
@@ -13,26 +13,18 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import WrenchStamped
 
 from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, loggable_text
 from us_sim.nodes.qos import STREAM
 
 GONE_S = 3.0  # without a report, after which a node counts as gone: each reports every second
 FORGOTTEN_S = 60.0  # after which a node that is gone is not shown any more
-HISTORY_S = 60.0
-FORCES_A_SECOND = 10  # points of the force that are kept: the largest of each interval
-PLOTTED = ("rate_hz", "latency_p50_ms", "latency_p99_ms", "residual", "difference_max_mm")
-"""Values of diagnostics whose histories are kept."""
-
-Point = tuple[float, float]  # s of the monotonic clock, and the value then
 
 
 class NodeLevel(Enum):
@@ -118,18 +110,15 @@ class PageCounter:
 
 
 class StatusBoard(PageCounter):
-    """The newest report of each node, and the histories that are plotted; for any thread.
+    """The newest report of each node; for any thread.
 
     Args:
-        on_watch: called when pages begin to show it, or to plot the force, or no longer do.
+        on_watch: called when pages begin to show it, or no longer do.
     """
 
     def __init__(self, on_watch: Callable[[], None] = lambda: None) -> None:
         super().__init__(on_watch)
-        self.force = PageCounter(on_watch)  # the pages that plot it
         self._nodes: dict[str, NodeStatus] = {}
-        self._histories: dict[tuple[str, str], deque[Point]] = {}
-        self._forces: deque[Point] = deque(maxlen=int(HISTORY_S * FORCES_A_SECOND))
         self._since = 0.0  # s, monotonic, since when pages show it; nothing is heard before
 
     def add_page(self) -> None:
@@ -151,20 +140,6 @@ class StatusBoard(PageCounter):
             self._nodes[status.name] = replace(
                 status, heard=now, problem=problem, problem_kind=kind, problem_heard=heard
             )
-            for key in PLOTTED:
-                number = status.read_number(key)
-                if number is not None:
-                    history = self._histories.setdefault((status.name, key), deque(maxlen=100))
-                    history.append((now, number))
-
-    def add_force(self, force: float, now: float) -> None:
-        """Keep the force on the probe in N, at a time of the monotonic clock in s."""
-        with self._lock:
-            if self._forces and now - self._forces[-1][0] < 1.0 / FORCES_A_SECOND:
-                begun, largest = self._forces[-1]
-                self._forces[-1] = begun, max(force, largest)
-            else:
-                self._forces.append((now, force))
 
     def list_nodes(self, now: float) -> list[NodeStatus]:
         """The nodes by name, without those that have long been gone."""
@@ -182,23 +157,9 @@ class StatusBoard(PageCounter):
         """One node, if it ever reported."""
         return next((each for each in self.list_nodes(now) if each.name == name), None)
 
-    def get_history(self, key: str, since: float) -> dict[str, list[Point]]:
-        """The values of one key after a time, by nodes."""
-        with self._lock:
-            return {
-                name: [point for point in points if point[0] > since]
-                for (name, told), points in sorted(self._histories.items())
-                if told == key and points[-1][0] > since
-            }
-
-    def get_forces(self, since: float) -> list[Point]:
-        """The force on the probe after a time, N."""
-        with self._lock:
-            return [point for point in self._forces if point[0] > since]
-
 
 class StatusListener(StatusBoard):
-    """A board that hears ``diagnostics``, and ``probe/wrench`` while the force is plotted.
+    """A board that hears ``diagnostics`` while a page shows it.
 
     Args:
         node: that listens.
@@ -211,13 +172,9 @@ class StatusListener(StatusBoard):
         self._reports = Subscriptions(
             node, (DiagnosticArray, "diagnostics", self._hear, STREAM, False)
         )
-        self._wrenches = Subscriptions(
-            node, (WrenchStamped, "probe/wrench", self._hear_force, STREAM, False)
-        )
 
     def _subscribe(self) -> None:
         self._reports.set_active(self.is_watched)
-        self._wrenches.set_active(self.force.is_watched)
 
     def _hear(self, message: DiagnosticArray) -> None:
         now = time.monotonic()
@@ -226,7 +183,3 @@ class StatusListener(StatusBoard):
             values = {each.key: loggable_text(each.value) for each in status.values}
             name = loggable_text(status.name).removeprefix(self._space)
             self.add_report(NodeStatus(name, level, loggable_text(status.message), values), now)
-
-    def _hear_force(self, message: WrenchStamped) -> None:
-        force = message.wrench.force
-        self.add_force((force.x**2 + force.y**2 + force.z**2) ** 0.5, time.monotonic())

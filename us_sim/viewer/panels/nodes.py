@@ -1,4 +1,4 @@
-"""Panels of the nodes: the scanner's console, the tissue, and the state of every node in plots."""
+"""Panels of the nodes: the scanner's console, the tissue, and the status of every node."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from us_sim.viewer.panels.sections import (
     format_title,
 )
 from us_sim.viewer.parameters import Parameter
-from us_sim.viewer.status import HISTORY_S, NodeLevel, NodeStatus, Point
+from us_sim.viewer.status import NodeLevel, NodeStatus
 from us_sim.viewer.stream import Simulator
 
 COMMON = ("depth", "gain", "dynamic_range", "focus", "time_gain", "grey_map", "overlay", "contact")
@@ -30,10 +30,6 @@ METHOD = ("solver", "compare_with")
 MATERIALS, STIFFNESS, PRESSURE = "materials.", ".young_modulus", ".lumen_pressure"
 RECENT_S = 20.0  # how long it is said that a setting was set back
 PROBLEM_S = 60.0  # how long the last problem of a node that is well again is shown
-HELD_BACK_S = 0.15
-"""The newest force waits for the next turn: until then a larger one may take its place."""
-
-Series = dict[str, list[Point]]
 
 
 def build_image(simulator: Simulator) -> None:
@@ -177,77 +173,3 @@ def make_row(status: NodeStatus, now: float) -> dict[str, Any]:
         "problem": problem,
         "isPast": not is_wrong,
     }
-
-
-class Plot(Element, component="plot.js"):
-    """One quantity over time.
-
-    Args:
-        title: of the quantity.
-        unit: of its values.
-        history: its values after a time, by nodes.
-        is_logarithmic: drawn by decades.
-    """
-
-    def __init__(
-        self,
-        title: str,
-        unit: str,
-        history: Callable[[float], Series],
-        is_logarithmic: bool = False,
-    ) -> None:
-        super().__init__()
-        self.props.update({"title": title, "unit": unit, "logarithmic": is_logarithmic})
-        self._history = history
-        self._told: dict[str, float] = {}
-
-    def start_plot(self) -> None:
-        """It begins to be shown, with nothing drawn."""
-        self._told = {}
-
-    def send_points(self, now: float) -> None:
-        """Send the new points; ``now`` is s of the monotonic clock."""
-        is_first = not self._told
-        oldest = now - HISTORY_S
-        new = []
-        for name, points in self._history(min(self._told.values(), default=oldest)).items():
-            told = self._told.get(name, oldest)
-            fresh = [(round(t, 3), value) for t, value in points if t > told]
-            if fresh:
-                self._told[name] = points[-1][0]
-                new.append((name, fresh))
-        self.run_method("add", round(now, 3), new, is_first)
-
-
-def build_plots(simulator: Simulator) -> None:
-    """Make plots of rates, latencies, the force and the residual over the last minute."""
-    board = simulator.status
-    plots: list[Plot] = []
-
-    def begin() -> None:
-        board.add_page()
-        board.force.add_page()
-        for plot in plots:
-            plot.start_plot()
-
-    def end() -> None:
-        board.remove_page()
-        board.force.remove_page()
-
-    def refresh() -> None:
-        now = time.monotonic()
-        for plot in plots:
-            plot.send_points(now)
-
-    def force(since: float) -> Series:
-        settled = time.monotonic() - HELD_BACK_S
-        points = [point for point in board.get_forces(since) if point[0] < settled]
-        return {"probe": points} if points else {}
-
-    with WhileShown(begin, end, STATUS_S, refresh):
-        plots += [
-            Plot("rate", "Hz", partial(board.get_history, "rate_hz")),
-            Plot("latency, median", "ms", partial(board.get_history, "latency_p50_ms")),
-            Plot("contact force", "N", force),
-            Plot("residual", "of the force", partial(board.get_history, "residual"), True),
-        ]
