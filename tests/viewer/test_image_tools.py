@@ -438,32 +438,22 @@ def test_a_picture_of_another_size_is_not_measured_and_says_why(
     assert values(page) == []
 
 
-@pytest.mark.parametrize(
-    ("kind", "ending", "begins"),
-    [("mp4", "mp4", b"\0\0\0\x1cftyp"), ("loop_dcm", "dcm", b"")],
-)
 def test_the_last_seconds_are_saved_as_they_are_seen(
-    page: Any, images: Images, tmp_path: Path, kind: str, ending: str, begins: bytes
+    page: Any, images: Images, tmp_path: Path
 ) -> None:
     for second, grey in ((41, 80), (42, 120)):
         images.show(grey, stamp=str(second * 10**9))
         await_grey(page, grey)
-    page.locator(".us-kinds").select_option(kind)
+    page.locator(".us-kinds").select_option("mp4")
     with page.expect_download() as download:
         page.keyboard.press("p")
-    assert download.value.suggested_filename.endswith(f".{ending}")
+    assert download.value.suggested_filename.endswith(".mp4")
     page.get_by_role("button", name="Freeze").wait_for()  # the page goes on
-    file = tmp_path / f"loop.{ending}"
+    file = tmp_path / "loop.mp4"
     download.value.save_as(file)
-    assert file.read_bytes().startswith(begins)
-    if ending == "dcm":
-        read = pytest.importorskip("pydicom").dcmread(file)
-        assert read.pixel_array[:, 5, 5].tolist() == [40, 80, 120]
-        assert list(read.FrameTimeVector) == [0, 1000, 1000]  # ms of their own time
-    else:
-        shown, picture = cv2.VideoCapture(str(file)).read()
-        assert shown
-        assert picture[200, 200].tolist() == pytest.approx([40] * 3, abs=4)
+    shown, picture = cv2.VideoCapture(str(file)).read()
+    assert shown
+    assert picture[200, 200].tolist() == pytest.approx([40] * 3, abs=4)
 
 
 def test_a_strip_is_frozen_with_the_image_and_saved_below_it(

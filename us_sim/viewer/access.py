@@ -1,14 +1,14 @@
-"""Who may open the page: closed by default, so that no other page and no stranger can.
+"""Access control of the page: it refuses requests of other origins, other hosts and strangers.
 
-A page of another origin can send requests to this computer in a person's name. So a request that
-says it comes from another origin is refused, websockets among them, for which browsers have no such
-rule of their own. A name that a stranger's server lets point to this computer (DNS rebinding) is
-refused by the request's host. Beyond this computer a token is needed: it is in the address that a
-person opens, and then in a cookie (OWASP, Cross-Site WebSocket Hijacking; RFC 6454).
+A page of another origin can send requests to this computer in a person's name, also by websocket,
+so the request's origin must be the page's own. The host must be this computer's own name, as a
+stranger's name may point to this computer (DNS rebinding). Other computers need a token: it is in
+the address that a person opens, and then in a cookie (OWASP, Cross-Site WebSocket Hijacking; RFC
+6454).
 
-No other page may frame this one, and scripts run only from files of the server, or where the page
-itself bears a number that is used once (W3C, Content Security Policy Level 3): a text that became
-an element of the page could not run anything.
+No other page may frame this one. Scripts run only from the server's files, or where the page itself
+bears a nonce (W3C, Content Security Policy Level 3), so a text that became an element of the page
+could not run anything.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlencode, urlsplit
 
 COOKIE = "us_sim_viewer_{port}"
-"""Cookies of two servers of one computer would be one, since they do not tell ports apart."""
+"""Name of the cookie; with the port, as servers on two ports of one computer share cookies."""
 _FORBIDDEN, _CLOSED = 403, 1008
 _SAFETY = (
     (b"x-content-type-options", b"nosniff"),
@@ -33,7 +33,7 @@ _POLICY = (
     "default-src 'none'",
     # Vue compiles the templates of NiceGUI's elements and ours in the browser, and NiceGUI's
     # server calls methods of elements by `eval`.
-    "script-src 'self' 'nonce-{number}' 'unsafe-eval'",
+    "script-src 'self' 'nonce-{nonce}' 'unsafe-eval'",
     # Vue and Quasar write style attributes, and the page's template has style elements.
     "style-src 'self' 'unsafe-inline'",
     "img-src 'self' data: blob:",  # pictures that the page itself has made
@@ -49,7 +49,7 @@ _SCRIPT = b"<script"  # as NiceGUI's page has it; texts from elsewhere are in it
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address, or a name, is this computer's own alone."""
+    """Return whether only this computer itself can reach the address or name."""
     if host.lower().rstrip(".") == "localhost":
         return True
     try:
@@ -59,11 +59,11 @@ def is_loopback(host: str) -> bool:
 
 
 class AccessControl:
-    """An ASGI application that passes only permitted requests on to another.
+    """An ASGI application that passes permitted requests on to another.
 
     Args:
-        app: the other.
-        token: that a request must bear; "" is none, and only this computer's names will do.
+        app: the other application.
+        token: of which each request must have a copy; "" permits only this computer's names.
     """
 
     def __init__(self, app: Any, token: str = "") -> None:
@@ -75,30 +75,30 @@ class AccessControl:
             await self._app(scope, receive, send)
             return
         if scope["type"] == "http":
-            send = _safely(scope, send)
-        wrong = self._wrong(scope)
-        if wrong:
-            await _refuse(scope, receive, send, wrong)
-        elif self._token and scope["type"] == "http" and self._given(scope):
-            await self._welcome(scope, send)
+            send = _add_safety_headers(scope, send)
+        refusal = self._find_refusal(scope)
+        if refusal:
+            await _refuse(scope, receive, send, refusal)
+        elif self._token and scope["type"] == "http" and self._has_token(scope):
+            await self._set_cookie(scope, send)
         else:
             await self._app(scope, receive, send)
 
-    def _wrong(self, scope: Any) -> str:
-        """Why a request is refused, for a person; "" where it is not."""
+    def _find_refusal(self, scope: Any) -> str:
+        """Return the reason to refuse a request, for a person; "" to permit it."""
         headers = dict(scope["headers"])
         host = headers.get(b"host", b"").decode("latin-1")
-        name = _name(host)
+        name = _remove_port(host)
         if not self._token and not is_loopback(name):
             return f"{name or 'no host'} is not this computer: open the address as it was printed"
         origin = headers.get(b"origin", b"").decode("latin-1")
         if origin and origin.lower().partition("://")[2] != host.lower():
             return f"pages of {origin} may not use the viewer: open the address as it was printed"
-        if self._token and not (self._given(scope) or self._has_cookie(scope, headers)):
+        if self._token and not (self._has_token(scope) or self._has_cookie(scope, headers)):
             return "the token is missing: open the address as it was printed, with all of it"
         return ""
 
-    def _given(self, scope: Any) -> bool:
+    def _has_token(self, scope: Any) -> bool:
         given = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [""])[0]
         return hmac.compare_digest(given.encode(), self._token.encode())
 
@@ -107,37 +107,37 @@ class AccessControl:
             cookies = SimpleCookie(headers.get(b"cookie", b"").decode("latin-1"))
         except CookieError:
             return False
-        name = _cookie(scope)
+        name = _name_cookie(scope)
         value = cookies[name].value if name in cookies else ""
         return hmac.compare_digest(value.encode(), self._token.encode())
 
-    async def _welcome(self, scope: Any, send: Any) -> None:
-        """Put the token into a cookie, and show the one page there is, without it."""
+    async def _set_cookie(self, scope: Any, send: Any) -> None:
+        """Put the token into a cookie, and redirect to the address without it."""
         query = parse_qs(scope["query_string"].decode("latin-1"), keep_blank_values=True)
         query.pop("token")
         rest = urlencode(query, doseq=True)
         where = f"/?{rest}" if rest else "/"
-        cookie = f"{_cookie(scope)}={self._token}; Path=/; HttpOnly; SameSite=Strict"
+        cookie = f"{_name_cookie(scope)}={self._token}; Path=/; HttpOnly; SameSite=Strict"
         headers = [(b"location", where.encode()), (b"set-cookie", cookie.encode())]
         await send({"type": "http.response.start", "status": 303, "headers": headers})
         await send({"type": "http.response.body", "body": b""})
 
 
-def _name(host: str) -> str:
-    """The host's name without its port; "" where it is none."""
+def _remove_port(host: str) -> str:
+    """Return the name in a host header, without its port; "" for nonsense."""
     try:
         return urlsplit(f"//{host}").hostname or ""
     except ValueError:
         return ""
 
 
-def _safely(scope: Any, send: Any) -> Any:
-    """A sender that adds headers against misuse, and to a page's scripts the number to run."""
-    number = secrets.token_urlsafe(16)
+def _add_safety_headers(scope: Any, send: Any) -> Any:
+    """Return a sender that adds headers against misuse, and the nonce to a page's scripts."""
+    nonce = secrets.token_urlsafe(16)
     host = dict(scope["headers"]).get(b"host", b"").decode("latin-1")
     # Older browsers do not take websockets for part of 'self'.
     sockets = f" ws://{host} wss://{host}" if re.fullmatch(r"[\w.:\[\]-]+", host) else ""
-    policy = "; ".join(_POLICY).format(number=number, sockets=sockets)
+    policy = "; ".join(_POLICY).format(nonce=nonce, sockets=sockets)
     begun: dict[str, Any] = {}
     page: list[bytes] = []
 
@@ -153,7 +153,7 @@ def _safely(scope: Any, send: Any) -> Any:
             page.append(message.get("body", b""))
             if message.get("more_body"):
                 return
-            body = b"".join(page).replace(_SCRIPT, _SCRIPT + f' nonce="{number}"'.encode())
+            body = b"".join(page).replace(_SCRIPT, _SCRIPT + f' nonce="{nonce}"'.encode())
             kept = [each for each in begun["headers"] if each[0] != b"content-length"]
             await send({**begun, "headers": [*kept, (b"content-length", b"%d" % len(body))]})
             message = {**message, "body": body}
@@ -162,7 +162,7 @@ def _safely(scope: Any, send: Any) -> Any:
     return answer
 
 
-def _cookie(scope: Any) -> str:
+def _name_cookie(scope: Any) -> str:
     return COOKIE.format(port=(scope.get("server") or ("", 0))[1])
 
 

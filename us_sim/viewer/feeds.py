@@ -1,7 +1,7 @@
-"""Streams to the pages, made of topics that are subscribed to only while a page watches them.
+"""Streams to the pages, from topics that the node subscribes to while a page watches them.
 
-Messages are kept as bytes; only those that a page takes are decoded and made into packets, in the
-page's thread. The node reports a message that cannot be used.
+Messages stay bytes until a page takes them: then the page's thread decodes them and makes packets.
+The node reports a message that cannot be used.
 """
 
 from __future__ import annotations
@@ -51,25 +51,25 @@ from us_sim.viewer.surfaces import (
     weld_corners,
 )
 
-_QUALITY = 90  # of JPEG: 512 × 512 pixels of speckle are 60 kB then, a quarter of what they were
+_QUALITY = 90  # of JPEG: 512 × 512 pixels of speckle take 60 kB, a quarter of the raw image
 _STRAIN_RATE = 12.0
-"""Hz: strain takes longer than positions, and its colours are read and not followed."""
+"""Hz: strain takes longer to compute than positions, and the eye does not follow its colours."""
 _NODES, _STRUCTURES = "tissue/nodes", "tissue/structures"
 _UNIMAGED, _UNPAIRED = 16, 32  # poses and forces, and states of the tissue, that are kept
 
 Make = Callable[[Any, int], Packet | None]
-"""The packet of a message and a number; None while none can be made."""
+"""Makes a packet from a message and its sequence number; returns None while it cannot."""
 
 
 def make_from_message(
     node: GuardedNode, message_type: Any, topic: str, data: bytes, make: Callable[[Any], Any]
 ) -> Any:
-    """The result of ``make`` for a message's bytes; None, and reported, where it refuses them."""
+    """Decode a message and apply ``make``; report an error of either and return None."""
 
-    def made() -> Any:
+    def decode_and_make() -> Any:
         return make(deserialize_message(data, message_type))
 
-    return node.guard_callback(node.resolve_topic_name(topic), made)()
+    return node.guard_callback(node.resolve_topic_name(topic), decode_and_make)()
 
 
 def make_topic_feed(
@@ -82,15 +82,17 @@ def make_topic_feed(
     rate: float | None,
     qos: QoSProfile = STREAM,
 ) -> Feed:
-    """A stream of the messages of one topic.
+    """Make the feed of one topic's messages.
 
     Args:
-        node: that subscribes.
-        post: has work done in the node's thread.
-        message_type, topic, qos: of the subscription.
-        make: the packet of a message; an error that it raises refuses the message.
+        node: the node that subscribes.
+        post: runs calls in the node's thread.
+        message_type: type of the topic.
+        topic: its name.
+        make: makes the packet of a message; an error that it raises is reported.
         kind: the stream's name.
-        rate: Hz, at most, for each page; None is all.
+        rate: Hz, largest rate for each page; None sends every message.
+        qos: of the subscription.
     """
 
     def offer(data: bytes) -> None:
@@ -99,7 +101,7 @@ def make_topic_feed(
         )
 
     subscription = Subscriptions(node, (message_type, topic, offer, qos, True))
-    # As it is once that is done: the page may have gone meanwhile.
+    # The call asks the feed again when it runs: the page may have gone meanwhile.
     feed = Feed(kind, lambda _: post(lambda: subscription.set_active(feed.is_watched)), rate)
     return feed
 
@@ -111,27 +113,28 @@ def make_image_feeds(
     known: Callable[[int], dict[str, Any]] = lambda _: {},
     arranged: Callable[[], tuple[bool, bool]] = lambda: (False, False),
 ) -> list[Feed]:
-    """The B-mode image as ``image`` and ``image_jpeg``, and pictures in colour.
+    """Make the feeds of the B-mode image, ``image`` and ``image_jpeg``, and of colour pictures.
 
-    The header of a B-mode image, and of the annotated one, says where its pixels are (``matrix``).
+    The headers of the B-mode image and of the annotated one have the places of the pixels as
+    ``matrix``: (4, 4), row by row, from (column, row, 0, 1) to m in frame ``probe``.
 
     Args:
-        node: that subscribes.
-        post: has work done in the node's thread.
-        rate: Hz, of images, at most, for each page.
-        known: more for the header of the image of a stamp, ns.
-        arranged: whether left and right are to be exchanged, as in the annotated image, and
-            whether that has the B-mode image at its left.
+        node: the node that subscribes.
+        post: runs calls in the node's thread.
+        rate: Hz, largest rate of images for each page.
+        known: returns more for the header of the image with a stamp, ns.
+        arranged: returns whether left and right are exchanged, as in the annotated image, and
+            whether the annotated image has the B-mode image at its left.
     """
-    places: list[NDArray[np.float64]] = []
+    places: list[NDArray[np.float64]] = []  # the newest matrix, once one has come
 
-    def place(message: Float64MultiArray) -> None:
+    def keep_place(message: Float64MultiArray) -> None:
         places[:] = [affine_from(message)]
 
-    node.subscribe(Float64MultiArray, "ultrasound/image_to_probe", place, LATCHED)
+    node.subscribe(Float64MultiArray, "ultrasound/image_to_probe", keep_place, LATCHED)
 
-    def telling(make: Callable[[Image, int, bool], Packet]) -> Make:
-        def tell(message: Image, sequence: int) -> Packet:
+    def add_header(make: Callable[[Image, int, bool], Packet]) -> Make:
+        def make_with_header(message: Image, sequence: int) -> Packet:
             flip, is_beside = arranged()
             packet = make(message, sequence, flip)
             header = {**packet.header, **known(int(packet.header["stamp"]))}
@@ -140,39 +143,42 @@ def make_image_feeds(
                 header["panels"] = panels
             for matrix in places:
                 columns = int(header["columns"]) // panels
-                of_pixels = _flipped(matrix, columns) if flip else matrix
-                header["matrix"] = of_pixels.ravel().tolist()
+                matrix = _flip_matrix(matrix, columns) if flip else matrix
+                header["matrix"] = matrix.ravel().tolist()
             return replace(packet, header=header)
 
-        return tell
+        return make_with_header
 
     def images(topic: str, kind: str, make: Make) -> Feed:
         return make_topic_feed(node, post, Image, topic, make, kind, rate)
 
     annotated = partial(_colour_jpeg, "annotated")
     return [
-        images("ultrasound/image", "image", telling(_pixels)),
-        images("ultrasound/image", "image_jpeg", telling(_grey_jpeg)),
-        images("ultrasound/image_annotated", "annotated", telling(lambda m, n, _: annotated(m, n))),
+        images("ultrasound/image", "image", add_header(_make_raw)),
+        images("ultrasound/image", "image_jpeg", add_header(_make_grey_jpeg)),
+        images(
+            "ultrasound/image_annotated", "annotated", add_header(lambda m, n, _: annotated(m, n))
+        ),
         *(images(strip.topic, kind, partial(_colour_jpeg, kind)) for kind, strip in STRIPS.items()),
     ]
 
 
-def _pixels(message: Image, sequence: int, flip: bool) -> Packet:
-    return Packet("image", sequence, _header(message, "mono8"), _grey(message, flip).tobytes())
+def _make_raw(message: Image, sequence: int, flip: bool) -> Packet:
+    header = _make_image_header(message, "mono8")
+    return Packet("image", sequence, header, _read_grey(message, flip).tobytes())
 
 
-def _grey_jpeg(message: Image, sequence: int, flip: bool) -> Packet:
-    return _jpeg(message, "image_jpeg", sequence, _grey(message, flip))
+def _make_grey_jpeg(message: Image, sequence: int, flip: bool) -> Packet:
+    return _make_jpeg(message, "image_jpeg", sequence, _read_grey(message, flip))
 
 
-def _grey(message: Image, flip: bool) -> NDArray[np.uint8]:
+def _read_grey(message: Image, flip: bool) -> NDArray[np.uint8]:
     pixels = pixels_from(message)
     return np.ascontiguousarray(pixels[:, ::-1] if flip else pixels)
 
 
-def _flipped(matrix: NDArray[np.float64], columns: int) -> NDArray[np.float64]:
-    """From (column, row, 0, 1) of the image whose left and right are exchanged."""
+def _flip_matrix(matrix: NDArray[np.float64], columns: int) -> NDArray[np.float64]:
+    """Return the matrix for the pixels of the image with left and right exchanged."""
     exchange = np.diag([-1.0, 1.0, 1.0, 1.0])
     exchange[0, 3] = columns - 1
     return matrix @ exchange
@@ -180,28 +186,29 @@ def _flipped(matrix: NDArray[np.float64], columns: int) -> NDArray[np.float64]:
 
 def _colour_jpeg(kind: str, message: Image, sequence: int) -> Packet:
     pixels = cv2.cvtColor(pixels_from(message, "rgb8"), cv2.COLOR_RGB2BGR)
-    return _jpeg(message, kind, sequence, pixels)
+    return _make_jpeg(message, kind, sequence, pixels)
 
 
-def _jpeg(message: Image, kind: str, sequence: int, pixels: NDArray[Any]) -> Packet:
+def _make_jpeg(message: Image, kind: str, sequence: int, pixels: NDArray[Any]) -> Packet:
     done, encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     if not done:
         raise VolumeError("the image cannot be made a JPEG")
-    return Packet(kind, sequence, _header(message, "jpeg"), encoded.tobytes())
+    return Packet(kind, sequence, _make_image_header(message, "jpeg"), encoded.tobytes())
 
 
-def _header(message: Image, encoding: str) -> dict[str, Any]:
+def _make_image_header(message: Image, encoding: str) -> dict[str, Any]:
     rows, columns = int(message.height), int(message.width)
-    return {"stamp": _stamp(message), "rows": rows, "columns": columns, "encoding": encoding}
+    stamp = _format_stamp(message)
+    return {"stamp": stamp, "rows": rows, "columns": columns, "encoding": encoding}
 
 
-def _stamp(message: Any) -> str:
-    """ns, as a text: it has more digits than a number of JavaScript."""
+def _format_stamp(message: Any) -> str:
+    """Return the stamp in ns as a text, as it has more digits than a number of JavaScript."""
     return str(nanoseconds_of(message.header.stamp))
 
 
 def read_surfaces(message: MarkerArray, frame: str) -> list[ColouredSurface]:
-    """One surface of each namespace, with shared vertices.
+    """Read one surface for each namespace, with shared vertices.
 
     Raises:
         MeshError: the corners do not make whole triangles, or one is not finite.
@@ -228,32 +235,32 @@ class ProbeFeeds:
             (PoseStamped, "probe/pose", self._on_pose, STREAM, False),
             (WrenchStamped, "probe/wrench", self._on_wrench, STREAM, False),
         )
-        told = make_topic_feed(
-            node, post, MarkerArray, "probe/marker", _shape, "probe_mesh", None, LATCHED
+        mesh = make_topic_feed(
+            node, post, MarkerArray, "probe/marker", _make_probe_mesh, "probe_mesh", None, LATCHED
         )
-        self.feeds: list[Feed] = [told, self._feed]
+        self.feeds: list[Feed] = [mesh, self._feed]
 
     def find_pose_and_wrench(self, stamp: str) -> dict[str, Any]:
-        """Position, quaternion, force and torque of a stamp, ns, as far as they are known.
+        """Return position, quaternion, force and torque with a stamp (ns), as far as known.
 
-        They are not while nobody watches the stream ``probe``.
+        Nothing is known while no page watches the stream ``probe``.
         """
         return self._poses.get(stamp, {}) | self._forces.get(stamp, {})
 
     def _listen(self) -> None:
         if self._subscriptions.set_active(self._feed.is_watched) and self._feed.is_watched:
-            self._forces.clear()  # of the time before
+            self._forces.clear()  # they are from before the pause
 
     def _on_pose(self, message: PoseStamped) -> None:
         pose = pose_from(message, "patient")
         place = {"position": pose.position.tolist(), "quaternion": pose.orientation.tolist()}
-        _keep(self._poses, _stamp(message), place, _UNIMAGED)
+        _keep(self._poses, _format_stamp(message), place, _UNIMAGED)
         self._offer()
 
     def _on_wrench(self, message: WrenchStamped) -> None:
         wrench = wrench_from(message, "probe").tolist()
         forces = {"force": wrench[:3], "torque": wrench[3:]}
-        _keep(self._forces, _stamp(message), forces, _UNIMAGED)
+        _keep(self._forces, _format_stamp(message), forces, _UNIMAGED)
         self._offer()
 
     def _offer(self) -> None:
@@ -262,21 +269,21 @@ class ProbeFeeds:
         stamp, place = next(reversed(self._poses.items()))
         header = {"stamp": stamp, **place}
         if self._forces:
-            of_force, force = next(reversed(self._forces.items()))
-            age = round(1e-9 * (int(stamp) - int(of_force)), 3)
-            header |= force | {"force_stamp": of_force, "force_age": age}
+            force_stamp, force = next(reversed(self._forces.items()))
+            age = round(1e-9 * (int(stamp) - int(force_stamp)), 3)
+            header |= force | {"force_stamp": force_stamp, "force_age": age}
         self._feed.offer_packet(lambda sequence: Packet("probe", sequence, header, b""))
 
 
 def _keep(kept: dict[Any, Any], key: Any, value: Any, most: int) -> None:
-    """Keep a value as the newest of at most so many."""
+    """Keep a value as the newest; drop the oldest beyond ``most``."""
     kept.pop(key, None)
     kept[key] = value
     if len(kept) > most:
         del kept[next(iter(kept))]
 
 
-def _shape(message: MarkerArray, sequence: int) -> Packet:
+def _make_probe_mesh(message: MarkerArray, sequence: int) -> Packet:
     parts = read_surfaces(message, "probe")
     return make_transducer_packet("probe_mesh", sequence, parts, line_from(message, "probe"))
 
@@ -287,19 +294,19 @@ class SkinFeeds:
     def __init__(self, node: GuardedNode, post: CallPoster, rate: float) -> None:
         self._surface: StreamedSurface | None = None
         self.feeds: list[Feed] = [
-            make_topic_feed(node, post, Mesh, "skin/mesh", self._tell, "skin_mesh", None, LATCHED),
+            make_topic_feed(node, post, Mesh, "skin/mesh", self._rest, "skin_mesh", None, LATCHED),
             make_topic_feed(node, post, PointCloud2, "skin/nodes", self._move, "skin", rate),
         ]
 
-    def _tell(self, message: Mesh, sequence: int) -> Packet:
+    def _rest(self, message: Mesh, sequence: int) -> Packet:
         self._surface = StreamedSurface(*mesh_from(message))
         return self._surface.make_rest_packet("skin_mesh", sequence)
 
     def _move(self, message: PointCloud2, sequence: int) -> Packet | None:
-        return _moved(self._surface, message, "skin", sequence)
+        return _make_moved(self._surface, message, "skin", sequence)
 
 
-def _moved(
+def _make_moved(
     surface: StreamedSurface | None, message: PointCloud2, kind: str, sequence: int
 ) -> Packet | None:
     if surface is None:
@@ -309,12 +316,12 @@ def _moved(
 
 
 class RestMeshListener:
-    """The tissue's mesh of ``tissue/rest`` and ``tissue/tetrahedra``, subscribed to while used.
+    """Follows the mesh of ``tissue/rest`` and ``tissue/tetrahedra`` while it has watchers.
 
-    One serves all who work with the mesh, in the node's thread.
+    One object serves all users of the mesh, in the node's thread.
 
     Args:
-        node: that subscribes.
+        node: the node that subscribes.
     """
 
     def __init__(self, node: GuardedNode) -> None:
@@ -330,17 +337,14 @@ class RestMeshListener:
         self.mesh: TetrahedralMesh | None = None
         self.surface: StreamedSurface | None = None  # its outer faces, with their edges
 
-    def set_watcher(self, came: Callable[[], None], is_wanted: bool = True) -> None:
-        """Have ``came`` called when there is another mesh, or no longer.
-
-        The mesh that is there is kept, and nobody is called for it.
-        """
-        if is_wanted == (came in self._watchers):
+    def set_watcher(self, on_mesh: Callable[[], None], is_wanted: bool = True) -> None:
+        """Call ``on_mesh`` for each new mesh from now on, or no longer; not for the present one."""
+        if is_wanted == (on_mesh in self._watchers):
             return
         if is_wanted:
-            self._watchers.append(came)
+            self._watchers.append(on_mesh)
         else:
-            self._watchers.remove(came)
+            self._watchers.remove(on_mesh)
         self._subscriptions.set_active(bool(self._watchers))
 
     def _take_rest(self, message: PointCloud2) -> None:
@@ -352,7 +356,11 @@ class RestMeshListener:
         self._make(is_complete=True)
 
     def _make(self, is_complete: bool) -> None:
-        """Make a mesh, unless the second message must still follow the first of another scene."""
+        """Make a mesh of both messages.
+
+        Args:
+            is_complete: the second message of a mesh has come; before, it may be another scene's.
+        """
         if self._rest is None or self._tetrahedra is None:
             return
         nodes = vectors_from(self._rest, "patient")
@@ -369,8 +377,8 @@ class RestMeshListener:
         if self.surface is not None and surface.number == self.surface.number:
             return
         self.mesh, self.surface = mesh, surface
-        for came in list(self._watchers):
-            self._node.guard_callback(self._node.resolve_topic_name("tissue/rest"), came)()
+        for on_mesh in list(self._watchers):
+            self._node.guard_callback(self._node.resolve_topic_name("tissue/rest"), on_mesh)()
 
 
 class TissueFeeds:
@@ -380,35 +388,34 @@ class TissueFeeds:
         self, node: GuardedNode, post: CallPoster, rate: float, rest: RestMeshListener
     ) -> None:
         self._rest = rest
-        self._number: int | None = None  # of the mesh that was told
+        self._number: int | None = None  # of the mesh that was offered
         self._strain: tuple[TetrahedralMesh, EquivalentStrain] | None = None
-        self._told = Feed("tissue_mesh", lambda _: post(self._listen), rate=None)
-        strain_rate = min(rate, _STRAIN_RATE)
+        self._mesh = Feed("tissue_mesh", lambda _: post(self._listen), rate=None)
+        slow = min(rate, _STRAIN_RATE)
         self.feeds: list[Feed] = [
-            self._told,
+            self._mesh,
             make_topic_feed(node, post, PointCloud2, _NODES, self._move, "tissue", rate),
-            make_topic_feed(
-                node, post, PointCloud2, _NODES, self._be_strained, "strain", strain_rate
-            ),
+            make_topic_feed(node, post, PointCloud2, _NODES, self._compute, "strain", slow),
         ]
 
     def _listen(self) -> None:
-        """Hear of meshes while a page watches; one may be there already."""
-        self._rest.set_watcher(self._offer, self._told.is_watched)
+        """Follow meshes while a page watches, and offer the one that may be there already."""
+        self._rest.set_watcher(self._offer, self._mesh.is_watched)
         self._offer()
 
     def _offer(self) -> None:
         surface = self._rest.surface
         if surface is not None and surface.number != self._number:
             self._number = surface.number
-            self._told.offer_packet(
+            self._mesh.offer_packet(
                 lambda sequence: surface.make_rest_packet("tissue_mesh", sequence)
             )
 
     def _move(self, message: PointCloud2, sequence: int) -> Packet | None:
-        return _moved(self._rest.surface, message, "tissue", sequence)
+        return _make_moved(self._rest.surface, message, "tissue", sequence)
 
-    def _be_strained(self, message: PointCloud2, sequence: int) -> Packet | None:
+    def _compute(self, message: PointCloud2, sequence: int) -> Packet | None:
+        """Compute the strain at the nodes; None before there is a mesh."""
         mesh, surface = self._rest.mesh, self._rest.surface
         if mesh is None or surface is None:
             return None
@@ -417,7 +424,7 @@ class TissueFeeds:
         nodes = vectors_from(message, "patient")
         if nodes.shape != mesh.nodes.shape:
             raise MeshError(f"{len(nodes)} nodes came, and the mesh has {len(mesh.nodes)}")
-        header = {"stamp": _stamp(message), "mesh": surface.number, "points": len(nodes)}
+        header = {"stamp": _format_stamp(message), "mesh": surface.number, "points": len(nodes)}
         values = self._strain[1].compute_strain(nodes).astype(np.float32)
         return Packet("strain", sequence, header, values.tobytes())
 
@@ -425,9 +432,9 @@ class TissueFeeds:
 class StructuresFeed:
     """The stream ``structures``, of ``tissue/structures``.
 
-    That is three megabytes a message, twenty times a second. So it is listened to until one
-    message has come whose stamp is also one of ``tissue/nodes``; then it is known where in the
-    tissue each vertex lies, and the page moves the structures with the tissue.
+    A message has three megabytes, and twenty come a second. The feed subscribes only until a
+    message has the stamp of one of ``tissue/nodes``. Then it knows the place of each vertex in the
+    tissue, and the page moves the structures with the tissue.
     """
 
     def __init__(self, node: GuardedNode, post: CallPoster, rest: RestMeshListener) -> None:
@@ -444,13 +451,13 @@ class StructuresFeed:
         self._making: threading.Thread | None = None
 
     def forget_structures(self) -> None:
-        """Drop those of a scene that another has taken the place of, if on the same mesh."""
+        """Drop the structures of the last scene; the next may have the same mesh."""
         self._made_for = None
         self.feed.forget_packet()
         self._listen()
 
     def _listen(self) -> None:
-        """Hear of meshes while watched, and of the rest until it has been used."""
+        """Follow meshes while watched, and nodes and structures until they have been used."""
         self._rest.set_watcher(self._listen, self.feed.is_watched)
         surface = self._rest.surface
         is_new = surface is not None and surface.number != self._made_for
@@ -475,7 +482,7 @@ class StructuresFeed:
             self._try()
 
     def _try(self) -> None:
-        """Have the structures made once they and the tissue's nodes of their stamp are there."""
+        """Start to make the structures once they and the nodes with their stamp are there."""
         stamp, data = self._structures or (-1, b"")
         nodes, mesh, surface = self._nodes.get(stamp), self._rest.mesh, self._rest.surface
         if nodes is None or mesh is None or surface is None or self._making is not None:
@@ -490,7 +497,9 @@ class StructuresFeed:
         self._listen()
 
     def _make(self, mesh: TetrahedralMesh, number: int, nodes: bytes, structures: bytes) -> None:
-        def carried_by(message: MarkerArray) -> CarriedSurfaces:
+        """Make the structures, in a thread of its own, and have them offered."""
+
+        def carry(message: MarkerArray) -> CarriedSurfaces:
             surfaces = read_surfaces(message, "patient")
             if not surfaces:
                 raise MeshError("there is no triangle in it")
@@ -501,13 +510,11 @@ class StructuresFeed:
         )
         carried = None
         if deformed is not None:
-            carried = make_from_message(
-                self._node, MarkerArray, _STRUCTURES, structures, carried_by
-            )
+            carried = make_from_message(self._node, MarkerArray, _STRUCTURES, structures, carry)
         self._post(lambda: self._end(number, carried, is_wrong=deformed is not None))
 
     def _end(self, number: int, carried: CarriedSurfaces | None, is_wrong: bool) -> None:
-        """Offer the structures. Those that cannot be used are not tried again."""
+        """Offer the structures; do not try unusable ones again."""
         self._making = None
         if carried is not None or is_wrong:
             self._made_for = number

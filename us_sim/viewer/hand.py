@@ -1,4 +1,4 @@
-"""The hand of the pages: moves the probe as they ask, unless somebody else moves it."""
+"""The pages' hand: it moves the probe as pages ask, unless something else moves it."""
 
 from __future__ import annotations
 
@@ -38,39 +38,36 @@ from us_sim.viewer.session import SessionState
 from us_sim.viewer.stream import CallPoster, Feed, Packet, Simulator
 
 MOVING_HZ = 60.0 if (os.cpu_count() or 1) > 2 else 30.0
-"""Poses a second: on two cores the simulator and the browser share them, and a page shows no more
-images than that."""
+"""Poses a second; on two cores, which the browser shares, a page shows no more images than 30."""
 RESTING_HZ = 5.0  # poses a second; images are called stale after half a second
 STREAMING, LATEST = 3.0, 1.45
-"""From pose to pose: how long after a command the next is expected, and then waited for. A timer's
-pose just before it would hold up the command's own."""
-LONGEST_STEP = 0.05
-"""s of movement at most between two poses: were the node held up, the probe would leap."""
-UNANSWERED = 3.0
-"""s without a pose of the tracked probe, after which it is said that nobody answers."""
+"""In intervals of poses: the time after a command in which the next is expected, and the longest
+wait for it. A timer's pose just before a command would hold up the command's own."""
+LONGEST_STEP = 0.05  # s of movement between two poses; after a delay the probe would leap
+UNANSWERED = 3.0  # s without a pose of the tracked probe, after which the page warns
 ASTRAY, SETTLED = 3e-3, 1.0
-"""m, and s of rest, from which on the tracked probe is not where it was put."""
-SAME_PATIENT = 0.02  # m, from one surface to the next: the probe stays where it is
-_KEPT = 512  # poses, until their images are made
+"""m from the commanded place, and s of rest before it is measured, beyond which the page warns."""
+SAME_PATIENT = 0.02  # m from an old surface to a new one: nearer, the probe stays in its place
+_KEPT = 512  # poses that are kept until their images come
 _HELD = "another page holds the probe: Take over moves it to this one"
 
 
 @dataclass(frozen=True)
 class ProbeLead:
-    """Who leads, and whether a page's hand may."""
+    """The source that moves the probe, and whether the hand may do so."""
 
     who: str  # a node, "tracker" for the scene's own, "hand", or "nobody"
-    obstacle: str = ""  # why the hand may not move the probe, for a person; "" if it may
-    can_take: bool = False  # whether a page can end what moves it
+    obstacle: str = ""  # reason for a person why the hand may not move the probe, if any
+    can_take: bool = False  # a page can end what moves it
 
 
 def find_lead(node: GuardedNode, session: SessionState, *, is_publishing: bool) -> ProbeLead:
-    """Find out who moves the probe, by who publishes and hears ``tracker/pose``.
+    """Find out who moves the probe, by the publishers and subscribers of ``tracker/pose``.
 
     Args:
-        node: whose hand would move it.
-        session: what is replayed.
-        is_publishing: whether that hand publishes already.
+        node: the node of the hand.
+        session: tells what is replayed.
+        is_publishing: the hand publishes already.
     """
     name = node.resolve_topic_name(LEAD_TOPIC)
     others = [info.node_name for info in node.get_publishers_info_by_topic(name)]
@@ -87,8 +84,8 @@ def find_lead(node: GuardedNode, session: SessionState, *, is_publishing: bool) 
         return ProbeLead(
             others[0], f"{others[0]} moves the probe: end it to take the probe yourself"
         )
-    hearers = [info.node_name for info in node.get_subscriptions_info_by_topic(name)]
-    if "probe_tracker" in hearers:
+    subscribers = [info.node_name for info in node.get_subscriptions_info_by_topic(name)]
+    if "probe_tracker" in subscribers:
         return ProbeLead("hand")
     if _is_offered(node, "probe/pose"):
         return ProbeLead(
@@ -104,11 +101,11 @@ def _is_offered(node: GuardedNode, topic: str) -> bool:
 
 
 class PatientSurface:
-    """The skin at rest; where the scene has none the tissue's upper side, else the plane z = 0.
+    """The surface to stand on: the skin at rest, else the tissue's upper side, else z = 0.
 
     Args:
-        node: that hears ``skin/mesh``.
-        rest: the tissue's mesh.
+        node: the node that subscribes to ``skin/mesh``.
+        rest: follows the tissue's mesh.
     """
 
     def __init__(self, node: GuardedNode, rest: RestMeshListener) -> None:
@@ -119,7 +116,7 @@ class PatientSurface:
         self._meshes = Subscriptions(node, (Mesh, "skin/mesh", self._on_skin, LATCHED, False))
 
     def follow_meshes(self, is_wanted: bool) -> None:
-        """Follow the meshes, or no longer."""
+        """Begin or end following the meshes of skin and tissue."""
         self._skin = self._tissue = None
         self._meshes.set_active(is_wanted)
         self._rest.set_watcher(self._on_tissue, is_wanted)
@@ -149,12 +146,12 @@ class PatientSurface:
 
 
 class HandState(Enum):
-    """What the hand does; ``docs/architecture.md`` draws what leads from one to the next."""
+    """State of the hand; ``docs/architecture.md`` draws the transitions."""
 
     IDLE = "no page watches"
-    WAITING = "somebody else leads, or it is not known where the probe is and stands"
-    RESTING = "it holds the probe, which stays"
-    MOVING = "it holds the probe, which moves, or is imaged as if it did"
+    WAITING = "something else leads, or the probe's pose or the surface is unknown"
+    RESTING = "the hand holds the probe still"
+    MOVING = "the hand moves the probe, or images go on while it rests"
 
     @property
     def holds_probe(self) -> bool:
@@ -165,24 +162,24 @@ class HandState(Enum):
 class ViewerHand:
     """A tracker source that pages move: ``tracker/pose`` in frame ``patient``.
 
-    It holds the probe only while a page watches and nobody else does: a driver or a player leads as
-    long as it has a publisher, and the hand goes on from where that has left the probe. One page
-    moves it: the first that does, until its connection ends or another takes over. Poses come as
-    soon as that asks, `MOVING_HZ` while the probe moves or a page watches what goes on by itself,
-    such as blood, and `RESTING_HZ` else.
+    It holds the probe while a page watches and nothing else publishes poses: a driver or a player
+    leads as long as it has a publisher, and then the hand goes on from the probe's place. One page
+    moves the hand: the first that does, until its connection ends or another page takes over. A
+    command publishes a pose at once. Besides, poses come at `MOVING_HZ` while the probe moves or a
+    page watches something that goes on by itself, such as blood, and else at `RESTING_HZ`.
 
     Args:
-        node: that publishes.
-        post: has work done in the node's thread.
-        simulator: given the stream ``hand`` and the commands ``hand`` and ``take``.
-        rest: the tissue's mesh, on which the probe stands where there is no skin.
+        node: the node that publishes.
+        post: runs calls in the node's thread.
+        simulator: gets the stream ``hand`` and the commands ``hand`` and ``take``.
+        rest: follows the tissue's mesh, on which the probe stands where there is no skin.
     """
 
     def __init__(
         self, node: GuardedNode, post: CallPoster, simulator: Simulator, rest: RestMeshListener
     ) -> None:
         self._node, self._post, self._simulator = node, post, simulator
-        # To a person's eye sliders follow at 10 Hz, and more would take time from the image.
+        # Sliders that follow at 10 Hz look smooth, and more would take time from the image.
         self.feed = Feed("hand", lambda _: post(self._on_watch), 10.0)
         simulator.add_feeds(self.feed)
         simulator.commands |= {"hand": self._on_command, "take": self._on_take}
@@ -190,7 +187,7 @@ class ViewerHand:
         self._state = HandState.IDLE
         self._lead = ProbeLead("nobody", "the viewer finds out who moves the probe")
         self._surface = PatientSurface(node, rest)
-        self._standing: StandingSurface | None = None  # the surface that the motion is on
+        self._standing: StandingSurface | None = None  # the surface of the motion
         self._motion: StanceMotion | None = None
         self._publisher: Any = None
         self._subscriptions = Subscriptions(
@@ -198,40 +195,40 @@ class ViewerHand:
             (PoseStamped, "probe/pose", self._on_pose, STREAM, False),
             (DiagnosticStatus, "probe/status", self._on_status, LATCHED, False),
         )
-        self._is_found = False  # whether it is known where the probe is, or that it is nowhere yet
-        self._elsewhere: Pose | None = None  # where somebody else has the probe
+        self._is_found = False  # the probe's pose is known, or known not to exist yet
+        self._elsewhere: Pose | None = None  # the probe's pose while the hand does not hold it
         # The page that holds the probe, "" if none does, and its connection. Only the web server's
         # thread sets them, in which all commands come: of two pages one is the first.
         self._page, self._connection = "", 0
-        self._wish: tuple[str, int] | None = None  # the last: its page, and that page's number
+        self._last: tuple[str, int] | None = None  # command: its page, and the page's number of it
         self._published: dict[int, tuple[float, tuple[str, int] | None]] = {}
-        """By stamp (ns): how deep (m) the pose is pressed, and the last wish that it contains."""
+        """By stamp (ns): the pose's press (m), and the last command that it contains."""
         self._warning = ""
-        # s, monotonic: when a page asked last, when the probe moved, was taken, and was said to be
-        # somewhere last, when a pose went out, and when it was looked who leads
+        # s, monotonic: times of the last command, movement, taking of the probe, tracked pose,
+        # published pose, and search for the lead
         self._asked_at = self._moved_at = self._held_at = self._followed_at = 0.0
         self._sent_at = self._looked_at = 0.0
         self._timer = node.create_timer(1.0 / RESTING_HZ, self._on_timer)
         self._timer.cancel()
 
     def describe_pose(self, stamp: int, position: ArrayLike | None) -> dict[str, Any]:
-        """Describe the pose of an image; any thread may ask.
+        """Describe the pose of an image; for any thread.
 
         Args:
             stamp: ns, of the pose.
-            position: (3,) m, where the probe is, for poses of others.
+            position: (3,) m, of the probe, for poses of other sources.
 
         Returns:
-            ``press`` (m), see `Stance`, and ``command``, the last wish in it: the page, and its
-            number for it; None for what is not known.
+            ``press`` (m), see `Stance`, and ``command``, the last command in the pose: the page,
+            and the page's number of the command. Unknown values are None.
         """
-        press, wish = self._published.get(stamp, (None, None))
+        press, command = self._published.get(stamp, (None, None))
         if press is None and self._standing is not None and position is not None:
             press = self._standing.find_foot(np.asarray(position, dtype=np.float64))[1]
-        return {"press": press, "command": wish}
+        return {"press": press, "command": command}
 
     def _enter(self, state: HandState) -> None:
-        """Go to another state, and begin and end all that depends on it."""
+        """Change the state, and begin and end everything that depends on it."""
         before, self._state = self._state, state
         is_watched = state is not HandState.IDLE
         if is_watched != (before is not HandState.IDLE):
@@ -252,7 +249,7 @@ class ViewerHand:
         (self._timer.reset if is_watched else self._timer.cancel)()
 
     def _take_probe(self) -> None:
-        """Hold it from where it is, or else where it was held, or at home."""
+        """Hold the probe at its present pose, else where it was held last, else at home."""
         assert self._standing is not None
         if self._elsewhere is not None:
             self._motion = StanceMotion(Stance.from_pose(self._elsewhere, self._standing))
@@ -263,7 +260,7 @@ class ViewerHand:
         self._moved_at = self._held_at = time.monotonic()
 
     def _on_watch(self) -> None:
-        """Begin with the first page, and leave everything when the last has gone."""
+        """Begin with the first page, and end with the last."""
         if self.feed.is_watched and self._state is HandState.IDLE:
             self._enter(HandState.WAITING)
             self._look()
@@ -280,9 +277,9 @@ class ViewerHand:
             self._look()
 
     def _look(self) -> None:
-        """Find out who leads and where to stand, and repeat the pose at rest."""
+        """Update the surface and the lead; repeat the pose at rest."""
         self._looked_at = time.monotonic()
-        self._stand()
+        self._update_surface()
         self._lead = self._find_lead()
         if self._lead.obstacle:
             if self._state.holds_probe:
@@ -297,7 +294,7 @@ class ViewerHand:
                 self._enter(HandState.MOVING)
 
     def _find_lead(self) -> ProbeLead:
-        """Find out who moves the probe; the hand, if there is also somewhere to begin."""
+        """Return who moves the probe; "nobody" while the surface or the probe's pose is unknown."""
         session = self._simulator.session.state
         lead = find_lead(self._node, session, is_publishing=self._state.holds_probe)
         if lead.obstacle:
@@ -308,8 +305,8 @@ class ViewerHand:
             return ProbeLead("nobody", "the viewer finds out where the probe is")
         return lead
 
-    def _stand(self) -> None:
-        """Stand on another surface: where the probe is, if that is near, else at home."""
+    def _update_surface(self) -> None:
+        """Take over a new surface: keep the probe's place if the surface is near, else go home."""
         surface = self._surface.find_surface()
         if surface is None or surface is self._standing:
             return
@@ -324,12 +321,12 @@ class ViewerHand:
             self._motion = StanceMotion(Stance.create_home(surface, HOME_PRESS))
 
     def _on_status(self, status: DiagnosticStatus) -> None:
-        """Learn where the probe was when poses ended; there it is unless this hand has had it."""
-        said = {each.key: each.value for each in status.values}
-        if "pose" in said:
-            pose = pose_from_text(said["pose"])
+        """Read the probe's last pose from the tracker's report, unless it is this hand's own."""
+        values = {each.key: each.value for each in status.values}
+        if "pose" in values:
+            pose = pose_from_text(values["pose"])
             own = str(next(reversed(self._published), None))
-            if not self._state.holds_probe and said.get("stamp") != own:
+            if not self._state.holds_probe and values.get("stamp") != own:
                 self._elsewhere = pose
         elif status.message != TrackingState.WAITING.value:  # poses come
             self._is_found |= self._motion is not None
@@ -339,7 +336,7 @@ class ViewerHand:
             self._look()
 
     def _on_pose(self, message: PoseStamped) -> None:
-        """Follow the probe while others have it; warn where it is not where the hand has put it."""
+        """Record the tracked pose; warn if it differs from the hand's."""
         pose = pose_from(message, PATIENT)
         now = self._followed_at = time.monotonic()
         if not self._state.holds_probe:
@@ -357,21 +354,21 @@ class ViewerHand:
                 )
 
     def _on_command(self, value: Any, connection: int) -> str | None:
-        """Take a page's command, in its thread; return why it is not obeyed, or None."""
+        """Accept a page's command, in the web server's thread; return the refusal, or None."""
         try:
-            asked = HandCommand.read(value)
+            command = HandCommand.read(value)
         except UsSimError as error:
             return str(error)
         if self._lead.obstacle:
             return self._lead.obstacle
-        if self._page not in ("", asked.source):
+        if self._page not in ("", command.source):
             return _HELD
-        self._page, self._connection = asked.source, connection
-        self._post(lambda: self._obey(asked))
+        self._page, self._connection = command.source, connection
+        self._post(lambda: self._obey(command))
         return None
 
     def _on_take(self, page: Any, connection: int) -> str | None:
-        """Let a page hold the probe, whichever held it; a replay that moves it ends."""
+        """Give a page the probe, whichever page held it, and end a replay that moves it."""
         if self._lead.can_take:
             self._simulator.session.ask_control(replay="")
         elif self._lead.obstacle:
@@ -384,14 +381,14 @@ class ViewerHand:
         if connection == self._connection:
             self._page = ""
 
-    def _obey(self, asked: HandCommand) -> None:
-        """Move to where a page wants the probe, from now on."""
+    def _obey(self, command: HandCommand) -> None:
+        """Start to move the probe as commanded."""
         if not self._state.holds_probe:
-            return  # somebody else has taken it meanwhile
+            return  # something else has taken the probe meanwhile
         assert self._motion is not None
         assert self._standing is not None
-        self._motion.aim_at(asked.change_stance(self._motion.goal, self._standing))
-        self._wish, self._asked_at = (asked.source, asked.sequence), time.monotonic()
+        self._motion.aim_at(command.change_stance(self._motion.goal, self._standing))
+        self._last, self._asked_at = (command.source, command.sequence), time.monotonic()
         if self._state is HandState.RESTING:
             self._enter(HandState.MOVING)
             self._advance(1.0 / MOVING_HZ)
@@ -399,7 +396,7 @@ class ViewerHand:
             self._advance(LONGEST_STEP)
 
     def _advance(self, longest: float) -> None:
-        """Publish where the movement is by now; at most so many s after the last pose."""
+        """Publish the motion's present pose, at most ``longest`` s after the last one."""
         assert self._motion is not None
         if not self._motion.is_at_rest:
             self._moved_at = time.monotonic()
@@ -415,8 +412,8 @@ class ViewerHand:
         stamp = self._node.get_clock().now()
         stance = self._motion.stance
         pose = stance.compute_pose(self._standing)
-        # Kept first: its image may be there at once.
-        self._published[stamp.nanoseconds] = stance.press, self._wish
+        # Kept before it is published, as its image may come at once.
+        self._published[stamp.nanoseconds] = stance.press, self._last
         if len(self._published) > _KEPT:
             del self._published[next(iter(self._published))]
         self._publisher.publish(pose_message(pose, stamp.to_msg(), PATIENT))
@@ -425,7 +422,7 @@ class ViewerHand:
         self._tell()
 
     def _tell(self) -> None:
-        """Tell the pages how the probe is held, and by whom."""
+        """Tell the pages the stance, who holds the probe, and warnings."""
         motion, surface = self._motion, self._standing
         stance, goal = (motion.stance, motion.goal) if motion is not None else (None, None)
         if not self._state.holds_probe and self._elsewhere is not None and surface is not None:
@@ -446,19 +443,19 @@ class ViewerHand:
             "warning": warning,
         }
         if surface is not None:
-            header["range"] = _range(surface)
+            header["range"] = _list_limits(surface)
         if stance is not None and goal is not None:
-            header |= {"stance": _numbers(stance), "goal": _numbers(goal)}
+            header |= {"stance": _list_numbers(stance), "goal": _list_numbers(goal)}
         self.feed.offer_packet(lambda sequence: Packet("hand", sequence, header, b""))
 
 
-def _range(surface: StandingSurface) -> dict[str, list[float]]:
-    """Return where the probe may be, m and rad, frame ``patient``."""
+def _list_limits(surface: StandingSurface) -> dict[str, list[float]]:
+    """Return the lower and upper limits of a stance, m and rad, frame ``patient``."""
     lower, upper = surface.lower.tolist(), surface.upper.tolist()
     place = {"x": [lower[0], upper[0]], "y": [lower[1], upper[1]]}
     return place | {"press": [-HIGHEST, DEEPEST], "tilt": [-STEEPEST, STEEPEST]}
 
 
-def _numbers(stance: Stance) -> dict[str, float]:
+def _list_numbers(stance: Stance) -> dict[str, float]:
     place = dict(zip("xyz", stance.point.tolist(), strict=True))
     return place | {name: getattr(stance, name) for name in SINGLE}

@@ -1,4 +1,4 @@
-"""What a page asks of the hand that holds the probe.
+"""Commands of a page to the hand that holds the probe.
 
 >>> from us_sim.tracking.virtual_hand import Stance, StandingSurface
 >>> asked = HandCommand.read({"source": "a", "sequence": 7, "to": {"press": 0.004}})
@@ -20,34 +20,34 @@ from us_sim.errors import MessageError
 from us_sim.settings.spelling import short_repr
 from us_sim.tracking.virtual_hand import Stance, StandingSurface
 
-HOME_PRESS = 1e-3  # m: where the probe begins it touches, so that there is an image
+HOME_PRESS = 1e-3  # m; the probe touches at home, so that there is an image
 LIFTED = -0.01  # m
 ANGLES = ("rotation", "fan", "rock")
 SINGLE = ("press", *ANGLES)
 _PLACES = ("home", "lift", "upright")
 _SIZES = {"to": {"point": 3, "x": 1, "y": 1}, "by": {"slide": 2}}
 _SIZES = {key: sizes | dict.fromkeys(SINGLE, 1) for key, sizes in _SIZES.items()}
-"""How many numbers each value (``to``) and each change (``by``) has."""
+"""Count of numbers of each value (``to``) and each change (``by``)."""
 _FARTHEST, _FULL = 10.0, 2.0 * math.pi  # m and rad
 _LONGEST_SOURCE, _LAST = 40, 2**53
 
 
 @dataclass(frozen=True)
 class HandCommand:
-    """One wish, as absolute values, changes, or a place that has a name."""
+    """One command, as absolute values, changes, or a named place."""
 
-    source: str  # of which page
-    sequence: int  # the page's number of the wish
+    source: str  # the page
+    sequence: int  # the page's number of the command
     to: Mapping[str, tuple[float, ...]]  # m and rad, by name
     by: Mapping[str, tuple[float, ...]]  # m and rad, by name
     go: str | None = None  # home: begin anew; lift: off the skin; upright: no angles
 
     @classmethod
     def read(cls, value: Any) -> HandCommand:
-        """Read what a page sent, decoded from JSON.
+        """Read a command from a page's message, decoded from JSON.
 
         Raises:
-            MessageError: it is no command.
+            MessageError: the message is no command.
         """
         known = {"source", "sequence", "to", "by", "go"}
         if not isinstance(value, dict) or not value.keys() <= known:
@@ -61,14 +61,14 @@ class HandCommand:
             raise MessageError(f"sequence: {short_repr(sequence)} is no count: load the page again")
         if go not in (None, *_PLACES):
             raise MessageError(f"go: {short_repr(go)} is none of {', '.join(_PLACES)}")
-        return cls(source, sequence, _numbers(value, "to"), _numbers(value, "by"), go)
+        return cls(source, sequence, _read_numbers(value, "to"), _read_numbers(value, "by"), go)
 
     def change_stance(self, goal: Stance, surface: StandingSurface) -> Stance:
-        """Return the stance that is wanted now, within a hand's limits.
+        """Return the new goal, within the hand's limits.
 
         Args:
-            goal: what was wanted before.
-            surface: that the probe stands on.
+            goal: the goal before the command.
+            surface: the surface on which the probe stands.
         """
         if self.go == "home":
             goal = Stance.create_home(surface, HOME_PRESS)
@@ -90,12 +90,12 @@ class HandCommand:
 
 
 def is_source(value: Any) -> TypeGuard[str]:
-    """Return whether it can be the name that a page has given itself."""
+    """Return whether a value can be a page's name for itself."""
     return isinstance(value, str) and 0 < len(value) <= _LONGEST_SOURCE
 
 
-def _numbers(value: dict[str, Any], key: str) -> dict[str, tuple[float, ...]]:
-    """Read the numbers of one part of a command."""
+def _read_numbers(value: dict[str, Any], key: str) -> dict[str, tuple[float, ...]]:
+    """Read the numbers of one part of a command, ``to`` or ``by``."""
     given, sizes = value.get(key, {}), _SIZES[key]
     if not isinstance(given, dict) or not given.keys() <= sizes.keys():
         raise MessageError(f"{key}: {short_repr(given)} is no object of {', '.join(sizes)}")

@@ -1,4 +1,4 @@
-"""The one page: header, 3D scene, image with its modes and strips, panels; and the application."""
+"""The page: header, 3D scene, image with its modes and strips, panels; and its application."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from nicegui import ui
 
 from us_sim.errors import UsSimError
 from us_sim.slicing.settings import OVERLAYS, STRIPS
-from us_sim.viewer.export import LARGEST, decode_frames, export_frames
+from us_sim.viewer.export import LARGEST, decode_frames, encode_video
 from us_sim.viewer.panels.asking import find_refusal, is_taken, set_parameter
 from us_sim.viewer.panels.exercise import ExercisePanel
 from us_sim.viewer.panels.nodes import TISSUE, build_image, build_status, build_tissue
@@ -37,7 +37,7 @@ MODES = {
     "none": ("Outlines", "With the outlines and names of structures, and marked when it is old"),
     **{name: mode[:2] for name, mode in OVERLAYS.items()},
 }
-"""Label and title by value of the parameter ``overlay``, and the plain image before them."""
+"""Label and title by mode: the plain image, then the values of the parameter ``overlay``."""
 SWITCHES = {
     BESIDE: ("Beside", "The B-mode image beside the one with outlines or colours, on all pages"),
     FLIP: (
@@ -45,26 +45,26 @@ SWITCHES = {
         "Exchange left and right, on all pages; the dot is at the side of the probe's mark",
     ),
 }
-"""Likewise, by parameters that are on or off."""
+"""Label and title by parameter that is on or off."""
 _CONTACT = {
     "none": "No contact: press the probe onto the skin",
     "poor": "Poor contact: press more, or tilt less",
 }
-_ABSENT = {
+_NO_FLOW = {
     "no_contact": "no contact there: press more, or tilt less",
     "no_vessel": "no vessel with a flow there: drag it over one",
     "no_flow": "the vessel is closed: press less",
     "across_flow": "the beams cross the flow at a right angle: tilt the probe, or steer the beams",
     "too_slow": "the flow is slower than the wall filter lets through",
 }
-_UNMOVED = 1e-5  # m, or of the face: by how much a place that was dragged may be as it was
+_UNMOVED = 1e-5  # m, or part of the face: a smaller drag does not move a place
 
 
 class ModeBar:
     """The bar of the image's modes, strips and switches."""
 
     def __init__(self, simulator: Simulator) -> None:
-        self._simulator = simulator
+        self._simulator, self._node = simulator, simulator.nodes.get_node(NODE)
         self._mode = "b-mode"
         self._buttons: dict[str, ui.button] = {}
         self._strips: dict[str, bool] = dict.fromkeys(STRIPS, False)
@@ -82,7 +82,7 @@ class ModeBar:
         bar.on("us-place", lambda event: self._move(event.args.get("detail")), ["detail"])
         self._mark()
         self._remarks: list[str] = []
-        _watch_while_connected(simulator.nodes.get_node(NODE), simulator.status)
+        _watch_while_connected(self._node, simulator.status)
         ui.timer(0.3, self._refresh)
 
     async def _choose(self, mode: str) -> None:
@@ -96,16 +96,16 @@ class ModeBar:
         self._mark()
 
     async def _set(self, name: str, value: object) -> bool:
-        """Set a parameter; whether that was not refused."""
-        return is_taken(await set_parameter(self._simulator.nodes.get_node(NODE), name, value))
+        """Set a parameter of the node; return whether the node took the value."""
+        return is_taken(await set_parameter(self._node, name, value))
 
     @property
     def _overlay(self) -> Any:
-        parameter = self._simulator.nodes.get_node(NODE).parameters.get(OVERLAY)
+        parameter = self._node.parameters.get(OVERLAY)
         return parameter.raw if parameter else None
 
     def _is_on(self, name: str) -> bool:
-        parameter = self._simulator.nodes.get_node(NODE).parameters.get(name)
+        parameter = self._node.parameters.get(name)
         return parameter is not None and bool(parameter.raw)
 
     def _show(self, mode: str) -> None:
@@ -120,12 +120,12 @@ class ModeBar:
         self._mark()
 
     def _refresh(self) -> None:
-        """Show changes that were made elsewhere, and the node's remarks on its images."""
-        remarks = self._wanted_remarks()
+        """Show changes from elsewhere, and the node's remarks on its images."""
+        remarks = self._list_remarks()
         if remarks != self._remarks:
             self._remarks = remarks
             _call("image.js", "setRemarks", remarks)
-        places = list(self._dragged())
+        places = list(self._list_places())
         if places != self._places:
             self._places = places
             _call("image_tools/places.js", "setPlaces", places)
@@ -141,8 +141,8 @@ class ModeBar:
             self._buttons[name].set_enabled(not find_refusal() or name in ("b-mode", known))
         self._mark()
 
-    def _wanted_remarks(self) -> list[str]:
-        """Reasons why the images show little, for a person."""
+    def _list_remarks(self) -> list[str]:
+        """Return the reasons why the images show little, for a person."""
         status = self._simulator.status.find_node(NODE, time.monotonic())
         values = status.values if status else {}
         remarks = [_CONTACT.get(values.get("contact", ""), "")]
@@ -153,42 +153,38 @@ class ModeBar:
         if tissue and tissue.values.get("problem") == "inside out":
             remarks.append("Tissue is inside out: press less, or choose another method")
         if self._mode == "velocity":
-            remarks.append(_absent("No colour", values.get("no_colour", ""), values))
+            remarks.append(_explain_no_flow("No colour", values.get("no_colour", ""), values))
         if self._strips["spectrum"]:
-            remarks.append(_absent("No spectrum", values.get("no_spectrum", ""), values))
+            remarks.append(_explain_no_flow("No spectrum", values.get("no_spectrum", ""), values))
         return [remark for remark in remarks if remark]
 
-    def _value(self, name: str) -> float | None:
-        """A number of the node in SI units; None where there is none."""
-        parameter = self._simulator.nodes.get_node(NODE).parameters.get(name)
-        if (
-            parameter is None
-            or parameter.kind is not ParameterKind.NUMBER
-            or parameter.value is None
-        ):
+    def _read_number(self, name: str) -> float | None:
+        """Return a parameter of the node in SI units; None if it is no number or has no value."""
+        parameter = self._node.parameters.get(name)
+        if parameter is None or parameter.kind is not ParameterKind.NUMBER:
             return None
-        return float(parameter.raw)
+        return float(parameter.raw) if parameter.value is not None else None
 
-    def _dragged(self) -> Iterator[dict[str, Any]]:
-        """The colour box, the gate and the line, which a person can drag; m and rad."""
-        deepest = self._value("depth")
+    def _list_places(self) -> Iterator[dict[str, Any]]:
+        """Yield the colour box, the gate and the line, which a person can drag; m and rad."""
+        deepest = self._read_number("depth")
         if deepest is None:
             return
-        otherwise = {"lateral": 0.0, "depth": 0.5 * deepest, "steering": 0.0, "width": 0.0}
-        otherwise |= {"height": 0.5 * deepest, "size": 0.0}
+        place = {"lateral": 0.0, "depth": 0.5 * deepest, "steering": 0.0, "width": 0.0}
+        place |= {"height": 0.5 * deepest, "size": 0.0}
         shown = {"colour": self._mode == "velocity", **self._strips}
         for kind, on in shown.items():
-            if on and self._value(f"{kind}.lateral") is not None:
-                found = {key: self._value(f"{kind}.{key}") or otherwise[key] for key in otherwise}
-                yield {"kind": kind, "deepest": deepest, **found}
+            if on and self._read_number(f"{kind}.lateral") is not None:
+                known = {key: self._read_number(f"{kind}.{key}") or place[key] for key in place}
+                yield {"kind": kind, "deepest": deepest, **known}
 
-    async def _move(self, asked: Any) -> None:
-        """Move the box, the gate or the line to where a person has dragged it."""
-        wanted = asked if isinstance(asked, dict) else {}
-        kind = wanted.get("kind")
+    async def _move(self, detail: Any) -> None:
+        """Move the box, the gate or the line as a person has dragged it."""
+        place = detail if isinstance(detail, dict) else {}
+        kind = place.get("kind")
         for name in ("lateral", "depth"):
-            parameter = self._simulator.nodes.get_node(NODE).parameters.get(f"{kind}.{name}")
-            value = wanted.get(name)
+            parameter = self._node.parameters.get(f"{kind}.{name}")
+            value = place.get(name)
             if parameter is None or kind not in ("colour", *STRIPS):
                 continue
             if not isinstance(value, int | float) or abs(value - parameter.raw) < _UNMOVED:
@@ -206,8 +202,8 @@ class ModeBar:
 
 def _call(module: str, function: str, *arguments: Any) -> None:
     """Call a function of one of the page's modules."""
-    told = ", ".join(map(json.dumps, arguments))
-    ui.run_javascript(f"import('/us_sim/assets/{module}').then(m => m.{function}({told}))")
+    listed = ", ".join(map(json.dumps, arguments))
+    ui.run_javascript(f"import('/us_sim/assets/{module}').then(m => m.{function}({listed}))")
 
 
 def _button(label: str, title: str, on_click: Any) -> ui.button:
@@ -216,15 +212,15 @@ def _button(label: str, title: str, on_click: Any) -> ui.button:
     return button
 
 
-def _absent(what: str, why: str, values: Mapping[str, str]) -> str:
-    """The reason why there is no flow, unless it is said of the whole image already."""
-    if why not in _ABSENT or (why == "no_contact" and values.get("contact") != "good"):
+def _explain_no_flow(what: str, reason: str, values: Mapping[str, str]) -> str:
+    """Explain why no flow is seen; "" if there is no reason or the whole image has it."""
+    if reason not in _NO_FLOW or (reason == "no_contact" and values.get("contact") != "good"):
         return ""
-    return f"{what}: {_ABSENT[why]}"
+    return f"{what}: {_NO_FLOW[reason]}"
 
 
 def describe_scene(state: SessionState) -> tuple[str, str]:
-    """The scene's name and a remark on it, which is often empty.
+    """Return the scene's name and a remark on its state, often empty.
 
     >>> describe_scene(SessionState(scene="upper_arm", state="starting", fraction=0.4))
     ('upper arm', 'starting, 40 %')
@@ -236,28 +232,28 @@ def describe_scene(state: SessionState) -> tuple[str, str]:
     name = state.scene.replace("_", " ")
     if state.is_busy:
         return name, f"{state.state}, {100 * state.fraction:.0f} %"
-    begun = "recording" if state.is_recording else f"recorder {state.record_state}:"
-    parts = [f"{begun} {PurePath(state.record).name}"] if state.record else []
+    activity = "recording" if state.is_recording else f"recorder {state.record_state}:"
+    parts = [f"{activity} {PurePath(state.record).name}"] if state.record else []
     if state.replay:
         parts.append(f"replay of {PurePath(state.replay).name}: {state.replay_state}")
     return name, " · ".join(filter(None, parts))
 
 
 def build_headline(simulator: Simulator) -> None:
-    """Make it inside the header."""
+    """Build the scene's name, its state and its problem inside the header."""
     board, nodes = simulator.session, simulator.status
     name = ui.label().classes("us-scene-name").props('id="us-scene"')
     words = ui.label().classes("us-headline").props('role="status"')
     problem = ui.label().classes("us-headline us-wrong").props('role="alert"')
 
     def refresh() -> None:
-        scene, told = describe_scene(board.state)
+        scene, remark = describe_scene(board.state)
         name.set_text(scene)
         if name.props.get("data-scene") != board.state.scene:
             name.props["data-scene"] = board.state.scene  # as the headers of images say it
             name.update()
         known = (each.values.get("preparing", "") for each in nodes.list_nodes(time.monotonic()))
-        words.set_text(" · ".join(filter(None, (*known, told))))
+        words.set_text(" · ".join(filter(None, (*known, remark))))
         problem.set_text(board.state.problem)
 
     _watch_while_connected(board, nodes)
@@ -265,7 +261,7 @@ def build_headline(simulator: Simulator) -> None:
 
 
 def _watch_while_connected(*shown: PageCounter | NodeParameters) -> None:
-    """Watch these from when the browser comes until it goes, also for a moment."""
+    """Count the page while its browser is connected; a browser may come and go several times."""
     connections = 0
 
     def change(by: int) -> None:
@@ -297,7 +293,7 @@ PANELS = [
 
 
 def build_page(simulator: Simulator) -> None:
-    """Make the page for one browser."""
+    """Build the page for one browser."""
     ui.add_head_html(_HEAD)
     ui.add_body_html('<script type="module" src="/us_sim/assets/main.js"></script>')
     ui.colors(primary="#4fb3bf", dark="#171b1f", dark_page="#0e1113", negative="#e5735c")
@@ -318,7 +314,7 @@ def build_page(simulator: Simulator) -> None:
             _block("strips")
             _block("image-tools")
         with _section("us-drawer", "Panels") as drawer:
-            tabs, tissue = _panels(simulator)
+            tabs, tissue = _build_panels(simulator)
     drawer.set_visibility(False)
     button.props["title"] = "Panels: image, tissue, cases, session, exercise, status"
     button.props["aria-label"] = "Panels"
@@ -329,7 +325,7 @@ def build_page(simulator: Simulator) -> None:
         button.props["aria-expanded"] = str(drawer.visible).lower()
 
     def show_exercise() -> None:
-        """Open its panel, once, when there is one and the window has room beside the 3D view."""
+        """Open the panel of an exercise once, if the window has room beside the 3D view."""
         if get_score(simulator).get("steps"):
             asking.deactivate()
             tabs.set_value("Exercise")
@@ -338,7 +334,7 @@ def build_page(simulator: Simulator) -> None:
                 ui.run_javascript(f"if (innerWidth > 939) {open_it}")
 
     def hide_truth() -> None:
-        """Leave out what tells of what there is to be found, while an exercise asks."""
+        """Hide the panel that shows the truth while an exercise asks for it."""
         hides = is_blind(get_score(simulator))
         tissue.set_visibility(not hides)
         if hides and tabs.value == TISSUE_TAB:
@@ -354,15 +350,15 @@ def _block(name: str) -> None:
 
 
 def _section(name: str, label: str) -> ui.element:
-    """A part of the page that assistive technology lists by its label."""
+    """Build a part of the page that assistive technology lists by its label."""
     section = ui.element("section")
     section.classes.append(name)
     section.props["aria-label"] = label
     return section
 
 
-def _panels(simulator: Simulator) -> tuple[ui.tabs, ui.tab]:
-    """Make the panels; return their tabs, and the one of the tissue."""
+def _build_panels(simulator: Simulator) -> tuple[ui.tabs, ui.tab]:
+    """Build the panels; return their tabs, and the tissue's tab."""
     made = {}
     with ui.tabs().props("dense no-caps").classes("us-tabs") as tabs:
         for name, icon, title, _ in PANELS:
@@ -379,8 +375,8 @@ ASSETS = Path(__file__).parent / "assets"
 
 
 def make_application(simulator: Simulator) -> Any:
-    """The ASGI application of one viewer; a process has one."""
-    # It warns of every path that is not there, as it was sent, with what a terminal obeys.
+    """Make the ASGI application of a viewer; a process can have one."""
+    # It logs every unknown path as it was sent, with its control characters for a terminal.
     logging.getLogger("nicegui").setLevel(logging.ERROR)
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     app.mount("/us_sim/assets", StaticFiles(directory=ASSETS))
@@ -389,36 +385,35 @@ def make_application(simulator: Simulator) -> Any:
     async def stream(websocket: WebSocket) -> None:
         await serve_page(websocket, simulator)
 
-    @app.post("/us_sim/export/{kind}")
-    async def export(kind: str, request: Request) -> Response:
+    @app.post("/us_sim/export")
+    async def export(request: Request) -> Response:
         message = bytearray()
         async for chunk in request.stream():
             message += chunk
             if len(message) > LARGEST:
                 return Response("that is too much to be saved: save less", 413)
         try:
-            frames = decode_frames(bytes(message))
-            made = await run_in_threadpool(export_frames, kind, frames)
+            video = await run_in_threadpool(encode_video, decode_frames(bytes(message)))
         except UsSimError as error:
             return Response(str(error), 400, media_type="text/plain")
-        return Response(made, media_type="application/octet-stream")
+        return Response(video, media_type="video/mp4")
 
     @ui.page("/")
     def page() -> None:
         build_page(simulator)
 
-    # Its bar above the page would say nothing that a person waits for.
+    # NiceGUI's progress bar above the page tells nothing that a person waits for.
     nicegui_app.config.quasar_config["loadingBar"]["skipHijack"] = True
     ui.run_with(
         app,
         language="en-US",
         title="us_sim",
         dark=True,
-        tailwind=False,  # a compiler in the page, which nothing here needs
+        tailwind=False,  # a compiler in the page, which is not needed
         gzip_middleware_factory=None,
         binding_refresh_interval=None,
         show_welcome_message=False,
-        # Of a busy computer a page misses beats: it would be loaded anew, with its panels closed.
+        # A page on a busy computer misses heartbeats; a reload would close its panels.
         reconnect_timeout=30.0,
         favicon=ASSETS / "probe.svg",
     )
@@ -426,7 +421,7 @@ def make_application(simulator: Simulator) -> Any:
 
 
 async def serve_page(websocket: WebSocket, simulator: Simulator) -> None:
-    """Stay with one page until it goes."""
+    """Serve one page's websocket until it closes."""
     await websocket.accept()
     loop = asyncio.get_running_loop()
     awake = asyncio.Event()
@@ -439,11 +434,11 @@ async def serve_page(websocket: WebSocket, simulator: Simulator) -> None:
     sending = asyncio.ensure_future(_send(websocket, page, awake))
     try:
         while True:
-            wrong = page.obey_message(await websocket.receive_text())
-            if wrong:
-                await websocket.send_text(json.dumps({"problem": wrong}))
+            problem = page.obey_message(await websocket.receive_text())
+            if problem:
+                await websocket.send_text(json.dumps({"problem": problem}))
     except (WebSocketDisconnect, RuntimeError, KeyError):
-        pass  # it has gone, or sends bytes, which no page does
+        pass  # the page has gone, or it sent bytes, which only a stranger does
     finally:
         sending.cancel()
         page.watch_kinds([])
@@ -453,12 +448,12 @@ async def serve_page(websocket: WebSocket, simulator: Simulator) -> None:
 
 async def _send(websocket: WebSocket, page: PageStream, awake: asyncio.Event) -> None:
     loop = asyncio.get_running_loop()
-    later: float | None = None
+    wait: float | None = None
     while True:
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(awake.wait(), later)
+            await asyncio.wait_for(awake.wait(), wait)
         awake.clear()
-        packets, later = page.collect_due(loop.time())
+        packets, wait = page.collect_due(loop.time())
         try:
             for packet in packets:
                 await websocket.send_bytes(packet)

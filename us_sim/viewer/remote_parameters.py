@@ -1,7 +1,7 @@
-"""Parameters of other nodes: read, followed and set while pages show them.
+"""Parameters of other nodes, read, followed and set while pages show them.
 
-The nodes of this package say more in a descriptor than ROS has fields for, as a JSON object in
-``additional_constraints``, see `us_sim.nodes.parameters`. Others may write there what they like.
+A descriptor of this package's nodes has more than ROS has fields for: a JSON object in
+``additional_constraints``, see `us_sim.nodes.parameters`. Other nodes may have any text there.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from us_sim.errors import SettingsError
 from us_sim.settings.quantity import units_of
 from us_sim.viewer.parameters import Parameter, ParameterKind
 
-ANSWER_S = 10.0  # how long an answer is waited for: a node that makes images anew may need seconds
-LOOK_S = 0.5  # how often it is looked whether a node has come, gone, or been started again
+ANSWER_S = 10.0  # for an answer: a node that makes images anew may need seconds
+LOOK_S = 0.5  # between two looks for nodes that have come, gone, or started again
 _OF_ROS = ("use_sim_time", "qos_overrides.", "start_type_description_service")
-"""Parameters that rclpy itself declares, or prefixes of them: not what a page is for."""
+"""Parameters, or prefixes of them, that rclpy itself declares; a page leaves them out."""
 
 ABSENT = "is not running"
 ASKED = "is being asked for its parameters"
@@ -36,49 +36,49 @@ THERE = ""
 
 def make_answer(sentence: str) -> Future[str]:
     """Return a future that holds the sentence already."""
-    told: Future[str] = Future()
-    told.set_result(sentence)
-    return told
+    answer: Future[str] = Future()
+    answer.set_result(sentence)
+    return answer
 
 
 def set_atomically(client: AsyncParameterClient, parameters: Sequence[RosParameter]) -> Future[str]:
-    """Set all of these parameters, or none; the future holds why not, or nothing."""
+    """Set all of these parameters or none; the future holds the refusal, or ""."""
     name = client.remote_node_name.rpartition("/")[2]
     if not client.services_are_ready():
         return make_answer(f"{name} offers no parameters at present")
-    told: Future[str] = Future()
+    refusal: Future[str] = Future()
 
     def on_answer(answer: Any) -> None:
         result = answer.result().result
-        if not told.done():  # somebody waits still
-            told.set_result("" if result.successful else result.reason or f"{name} refuses it")
+        if not refusal.done():  # somebody still waits
+            refusal.set_result("" if result.successful else result.reason or f"{name} refuses it")
 
     client.set_parameters_atomically(parameters).add_done_callback(on_answer)
-    return told
+    return refusal
 
 
-async def await_answer(told: Future[str], name: str) -> str:
-    """Await what a node says, or say that it says nothing."""
+async def await_answer(answer: Future[str], name: str) -> str:
+    """Await a node's answer; after `ANSWER_S` return a sentence that it did not answer."""
     try:
-        return await asyncio.wait_for(asyncio.wrap_future(told), ANSWER_S)
+        return await asyncio.wait_for(asyncio.wrap_future(answer), ANSWER_S)
     except TimeoutError:
         return f"{name} did not answer within {ANSWER_S:g} s"
 
 
 Door = Callable[..., "Future[str]"]
-"""Sets parameters, given by name; the future holds why not, or nothing."""
+"""Sets parameters, given by name; the future holds the refusal, or ""."""
 
 
 class NodeParameters:
     """The parameters of another node, up to date while pages show them.
 
-    A node is told from one of the same name that was started later by who publishes its parameter
-    events, as the middleware numbers publishers. Any thread may read `state` and `parameters`; the
-    rest is for the event loop that serves the pages, while another thread spins the client's node.
+    The publisher of its parameter events has another number after a restart of the node. Any thread
+    may read `state` and `parameters`. The rest is for the event loop that serves the pages, while
+    another thread spins the client's node.
 
     Args:
         name: of the node, within the namespace.
-        client: asks the node; without one nothing is asked.
+        client: asks the node; None asks nothing.
         door: sets parameters in place of the client.
     """
 
@@ -91,25 +91,26 @@ class NodeParameters:
         self.pages = 0  # that show them
         self._client, self._door = client, door
         self._following: asyncio.Task[None] | None = None
-        self._is_old = asyncio.Event()  # what is known
+        self._is_old = asyncio.Event()  # the parameters must be read anew
 
     def add_page(self) -> None:
-        """Follow the parameters, until `remove_page`."""
+        """Count a page that shows the parameters; with the first, begin to follow them."""
         self.pages += 1
         if self.pages == 1 and self._client is not None:
             self._following = asyncio.ensure_future(self._follow(self._client))
 
     def remove_page(self) -> None:
-        """Follow them no longer."""
+        """Count a page less; with the last, stop following the parameters."""
         self.pages -= 1
         if not self.pages and self._following is not None:
             self._following.cancel()
 
     async def set_value(self, name: str, value: Any) -> str:
-        """Set a parameter to a value in the unit that is shown; None is nothing.
+        """Set a parameter to a value in the shown unit; return the refusal, or "".
 
-        Returns:
-            the reason if it is refused, an empty text if not.
+        Args:
+            name: of the parameter.
+            value: in the parameter's ``unit``; None is nothing.
         """
         parameter = self.parameters.get(name)
         if parameter is None:
@@ -123,15 +124,15 @@ class NodeParameters:
         name = parameter.name
         if self._door is not None:
             return await await_answer(self._door(**{name: raw}), self.name)
-        assert self._client is not None  # which has told of the parameter
-        told = set_atomically(self._client, [RosParameter(name, parameter.kind.value, raw)])
-        refused = await await_answer(told, self.name)
-        if not refused and self.parameters.get(name) is parameter:  # nothing newer has come
+        assert self._client is not None  # it has read the parameter
+        answer = set_atomically(self._client, [RosParameter(name, parameter.kind.value, raw)])
+        refusal = await await_answer(answer, self.name)
+        if not refusal and self.parameters.get(name) is parameter:  # nothing newer has come
             self.parameters = {**self.parameters, name: parameter.with_raw(raw)}
-        return refused
+        return refusal
 
     async def _follow(self, client: AsyncParameterClient) -> None:
-        """Read the parameters, again whenever they are another process's, and follow changes."""
+        """Read the parameters, again after a restart of the node, and follow changes."""
         loop, is_old, name = asyncio.get_running_loop(), self._is_old, client.remote_node_name
 
         def on_event(event: ParameterEvent) -> None:
@@ -161,7 +162,7 @@ class NodeParameters:
             client.node.destroy_subscription(events)
 
     async def _read(self, client: AsyncParameterClient) -> None:
-        """Ask for all parameters; what is known of them stays until the answers are there."""
+        """Read all parameters; keep the old ones until the answers are there."""
         before = self.parameters
         try:
             async with asyncio.timeout(ANSWER_S):
@@ -170,9 +171,9 @@ class NodeParameters:
                 listed = (await _answer(client.list_parameters())).result.names
                 names = [name for name in listed if not name.startswith(_OF_ROS)]
                 types = (await _answer(client.get_parameter_types(names))).types
-                # Of one without a value rclpy tells none, and with it of no other one.
+                # For a parameter without a value rclpy answers with no values at all.
                 names = [name for name, type_ in zip(names, types, strict=False) if type_]
-                told = (await _answer(client.describe_parameters(names))).descriptors
+                described = (await _answer(client.describe_parameters(names))).descriptors
                 values = (await _answer(client.get_parameters(names))).values
         except TimeoutError:
             self.state = SILENT
@@ -181,18 +182,18 @@ class NodeParameters:
         if self.parameters is not before:
             self._is_old.set()  # what was answered may be older than an event
         self.state = THERE
-        self.parameters = {  # none where one was undeclared meanwhile
-            name: _parameter(self.name, name, descriptor, value)
-            for name, descriptor, value in zip(names, told, values, strict=False)
+        self.parameters = {  # empty where one was undeclared meanwhile
+            name: _make_parameter(self.name, name, descriptor, value)
+            for name, descriptor, value in zip(names, described, values, strict=False)
         }
 
     def _update(self, event: ParameterEvent) -> None:
-        """Take over parameters that were declared, set or undeclared."""
+        """Take over new values; have the parameters read anew where some came or went."""
         if event.deleted_parameters:
             self._is_old.set()
         for message in (*event.new_parameters, *event.changed_parameters):
             known = self.parameters.get(message.name)
-            kind, raw = _value(message.value)
+            kind, raw = _read_value(message.value)
             if known is not None and known.kind is kind:
                 self.parameters = {**self.parameters, message.name: known.with_raw(raw)}
             elif not message.name.startswith(_OF_ROS):
@@ -200,11 +201,11 @@ class NodeParameters:
 
 
 class RemoteParameters:
-    """The parameters of all nodes; without ``node``, of none.
+    """The parameters of all nodes.
 
     Args:
-        node: that asks.
-        doors: by the names of nodes, functions that set their parameters in place of them.
+        node: the node whose clients ask; None asks nothing.
+        doors: by a node's name, a function that sets parameters in place of its client.
     """
 
     def __init__(self, node: Node | None = None, doors: Mapping[str, Door] | None = None) -> None:
@@ -212,7 +213,7 @@ class RemoteParameters:
         self._nodes: dict[str, NodeParameters] = {}
 
     def get_node(self, name: str) -> NodeParameters:
-        """Return those of a node, always the same object; any thread may ask."""
+        """Return a node's parameters, always the same object; for any thread."""
         made = self._nodes.get(name)
         return made or self._nodes.setdefault(name, self._make(name))
 
@@ -225,12 +226,12 @@ class RemoteParameters:
 
 
 async def _answer(asked: Any) -> Any:
-    """Await an answer in the running event loop that comes in the thread that spins the node."""
+    """Await, in the running event loop, an answer that comes in the node's thread."""
     loop = asyncio.get_running_loop()
     answer: asyncio.Future[Any] = loop.create_future()
 
     def deliver() -> None:
-        if not answer.done():  # nobody has given it up
+        if not answer.done():  # somebody still waits
             answer.set_result(asked.result())
 
     def on_answer(_: Any) -> None:
@@ -241,20 +242,20 @@ async def _answer(asked: Any) -> Any:
     return await answer
 
 
-def _parameter(
+def _make_parameter(
     node: str, name: str, descriptor: ParameterDescriptor, value: ParameterValue
 ) -> Parameter:
-    """Make the parameter of what its node says of it."""
-    kind, raw = _value(value)
+    """Make a parameter of its descriptor and its value."""
+    kind, raw = _read_value(value)
     try:
-        told = json.loads(descriptor.additional_constraints)
+        more = json.loads(descriptor.additional_constraints)
     except (ValueError, RecursionError):
-        told = None
-    told = told if isinstance(told, dict) else {}  # another's node has something else there
-    unit, reads = str(told.get("unit", "")), str(told.get("shown_in", ""))
+        more = None
+    more = more if isinstance(more, dict) else {}  # a foreign node has something else there
+    unit, shown_in = str(more.get("unit", "")), str(more.get("shown_in", ""))
     sizes = units_of(unit)
-    reads = reads if reads in sizes else unit
-    choices = told.get("choices")
+    shown_in = shown_in if shown_in in sizes else unit
+    choices = more.get("choices")
     meanings = {str(k): str(v) for k, v in choices.items()} if isinstance(choices, dict) else {}
     ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
     return Parameter(
@@ -262,19 +263,19 @@ def _parameter(
         name,
         kind,
         raw,
-        unit=reads,
-        size=sizes.get(reads, 1.0),
+        unit=shown_in,
+        size=sizes.get(shown_in, 1.0),
         limits=(float(ranges[0].from_value), float(ranges[0].to_value)) if ranges else None,
         choices=tuple(meanings),
         meanings={choice: text for choice, text in meanings.items() if text},
-        may_be_nothing="none" in told,
+        may_be_nothing="none" in more,
         description=descriptor.description,
         is_live=not descriptor.read_only and kind is not ParameterKind.OTHER,
     )
 
 
-def _value(value: ParameterValue) -> tuple[ParameterKind, Any]:
-    """Return a value's kind and its value; lists are tuples."""
+def _read_value(value: ParameterValue) -> tuple[ParameterKind, Any]:
+    """Return the kind and the Python value; lists are tuples."""
     kind, raw = ParameterKind(RosParameter.Type(value.type)), parameter_value_to_python(value)
     if kind is ParameterKind.OTHER:
         return kind, None

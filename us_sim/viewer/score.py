@@ -1,4 +1,4 @@
-"""The score as pages see it: streams of what `scorer` says, and what pages ask of it."""
+"""The score for pages: streams of the node `scorer`, and the pages' requests to it."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from us_sim.viewer.feeds import make_topic_feed
 from us_sim.viewer.stream import CallPoster, Packet, Simulator
 
 SCORE, PICTURE = "score", "score_picture"
-"""Streams: of an exercise's steps and the metrics, and of their picture as PNG."""
+"""Streams of an exercise's steps and metrics, and of their picture as PNG."""
 _STATES = {DiagnosticStatus.OK: "done", DiagnosticStatus.ERROR: "missed"}
 
 
 def connect_scorer(node: GuardedNode, post: CallPoster, simulator: Simulator) -> None:
-    """Give pages the score, have them ask `scorer`, and mark when they freeze an image.
+    """Add the score's feeds, requests to `scorer`, and marks of frozen images to the simulator.
 
     Args:
-        node: that listens.
-        post: has work done in the thread that spins ``node``.
-        simulator: what pages see.
+        node: the node that subscribes.
+        post: runs calls in the node's thread.
+        simulator: the simulator as pages see it.
     """
     marks = node.create_publisher(
         String, MARKER, STREAM, qos_overriding_options=qos_override_options()
@@ -54,20 +54,28 @@ def connect_scorer(node: GuardedNode, post: CallPoster, simulator: Simulator) ->
             node, post, DiagnosticArray, "score", make_score_packet, SCORE, None, LATCHED
         ),
         make_topic_feed(
-            node, post, CompressedImage, "score/picture", _picture, PICTURE, None, LATCHED
+            node,
+            post,
+            CompressedImage,
+            "score/picture",
+            _make_picture_packet,
+            PICTURE,
+            None,
+            LATCHED,
         ),
     )
 
 
 def make_score_packet(message: DiagnosticArray, sequence: int) -> Packet:
-    """Return a packet of the document of `us_sim.scoring.result`, without a payload."""
+    """Make a packet whose header is the document of `us_sim.scoring.result`."""
     first, *others = message.status or [DiagnosticStatus()]
-    of_kind: dict[str, list[DiagnosticStatus]] = {}
+    by_kind: dict[str, list[DiagnosticStatus]] = {}
     for status in others:
-        of_kind.setdefault(loggable_text(status.hardware_id), []).append(status)
-    plain, about = (of_kind.get(kind, [DiagnosticStatus()])[0] for kind in ("plain", "about"))
+        by_kind.setdefault(loggable_text(status.hardware_id), []).append(status)
+    plain, about = (by_kind.get(kind, [DiagnosticStatus()])[0] for kind in ("plain", "about"))
     faults = [
-        {"what": loggable_text(each.message), **_values(each)} for each in of_kind.get("fault", [])
+        {"seconds": "", "what": loggable_text(each.message), **_read_values(each)}
+        for each in by_kind.get("fault", [])
     ]
     state = plain.message if plain.message in STATES else "to lift"
     header = {
@@ -76,48 +84,48 @@ def make_score_packet(message: DiagnosticArray, sequence: int) -> Packet:
         "scene": loggable_text(first.hardware_id),
         "state": state,
         "words": STATES[state],
-        "about": {"begun": "", "feedback": "live", **_values(about)},
-        "plain": _values(plain),
-        "steps": [_step(status) for status in of_kind.get("step", [])],
-        "faults": [{"seconds": "", **each} for each in faults],
-        "metrics": _values(first),
+        "about": {"begun": "", "feedback": "live", **_read_values(about)},
+        "plain": _read_values(plain),
+        "steps": [_read_step(status) for status in by_kind.get("step", [])],
+        "faults": faults,
+        "metrics": _read_values(first),
     }
     return Packet(SCORE, sequence, header, b"")
 
 
 def get_score(simulator: Simulator) -> Mapping[str, Any]:
-    """Return the newest score of the scene that runs; empty where there is none."""
+    """Return the newest score of the running scene; empty if there is none."""
     feed, state = simulator.feeds.get(SCORE), simulator.session.state
     packet = feed.get_newest() if feed is not None else None
     is_other = packet is not None and state.is_there and packet.header["scene"] != state.scene
     return {} if packet is None or is_other else packet.header
 
 
-def is_blind(told: Mapping[str, Any]) -> bool:
-    """Return whether nothing may be shown of a score's scene that a scanner does not show."""
-    is_hidden = told.get("about", {}).get("feedback") == "afterwards"
-    return is_hidden and told["state"] not in ("passed", "not passed")
+def is_blind(score: Mapping[str, Any]) -> bool:
+    """Return whether the page may show only what a scanner shows, until the exercise ends."""
+    is_hidden = score.get("about", {}).get("feedback") == "afterwards"
+    return is_hidden and score["state"] not in ("passed", "not passed")
 
 
-def _values(status: DiagnosticStatus) -> dict[str, str]:
+def _read_values(status: DiagnosticStatus) -> dict[str, str]:
     return {loggable_text(each.key): loggable_text(each.value) for each in status.values}
 
 
-def _step(status: DiagnosticStatus) -> dict[str, Any]:
+def _read_step(status: DiagnosticStatus) -> dict[str, Any]:
     step = {"what": loggable_text(status.name), "seen": loggable_text(status.message)}
     step["state"] = _STATES.get(status.level, "to do")
-    points = _read_points(_values(status).get("target", ""))
+    points = _read_points(_read_values(status).get("target", ""))
     return step | ({"target": points} if points else {})
 
 
 def _read_points(text: str) -> list[Any]:
-    """Read the finite points (P, 3) m of a JSON list; none where it is no such list."""
+    """Read a JSON list of finite points (P, 3), m; empty if the text is no such list."""
     try:
-        numbers = np.array(json.loads(text), np.float64).reshape(-1, 3)
+        points = np.array(json.loads(text), np.float64).reshape(-1, 3)
     except (ValueError, TypeError, ArithmeticError, RecursionError):
         return []
-    return numbers.tolist() if np.isfinite(numbers).all() else []
+    return points.tolist() if np.isfinite(points).all() else []
 
 
-def _picture(message: CompressedImage, sequence: int) -> Packet:
+def _make_picture_packet(message: CompressedImage, sequence: int) -> Packet:
     return Packet(PICTURE, sequence, {}, bytes(message.data))

@@ -16,20 +16,20 @@ from us_sim.cache import cache_folder
 from us_sim.errors import UsSimError
 from us_sim.viewer.access import AccessControl, is_loopback
 
-if TYPE_CHECKING:  # since `us_sim.run.plan` asks for a free port where there is no rclpy
+if TYPE_CHECKING:  # `us_sim.run.plan` asks for a free port where there is no rclpy
     from us_sim.viewer.stream import Simulator
 
 
 def require_free_address(host: str, port: int) -> None:
-    """Raise UsSimError when nobody can listen there now."""
+    """Raise UsSimError if nobody can listen at the address now."""
     open_socket(host, port).close()
 
 
 def open_socket(host: str, port: int) -> socket.socket:
-    """A socket that listens there.
+    """Open a socket that listens at the address.
 
     Raises:
-        UsSimError: it cannot.
+        UsSimError: the address is none of this computer, or taken.
     """
     try:
         family, kind, protocol, _, where = socket.getaddrinfo(
@@ -60,13 +60,13 @@ def open_socket(host: str, port: int) -> socket.socket:
 
 
 class WebServer:
-    """Serves the page until it is closed.
+    """Serves the page, in a thread of its own, until it is closed.
 
     Args:
         simulator: what the page shows.
-        host: address to listen at; any but this computer's own needs the token in the address.
-        port: TCP; 0 is any that is free.
-        token: that one; "" is a new one.
+        host: address to listen at; other computers need a token.
+        port: of TCP; 0 takes any free one.
+        token: the token; "" makes a new one.
 
     Raises:
         UsSimError: NiceGUI is not installed, the address cannot be listened at, or the token is
@@ -76,14 +76,14 @@ class WebServer:
     def __init__(
         self, simulator: Simulator, host: str = "127.0.0.1", port: int = 8080, token: str = ""
     ) -> None:
-        self.token = "" if is_loopback(host) else _checked(token) or secrets.token_urlsafe(16)
-        self._uvicorn, application = _made(simulator)
+        self.token = "" if is_loopback(host) else _check_token(token) or secrets.token_urlsafe(16)
+        self._uvicorn, application = _import_server(simulator)
         self._socket = open_socket(host, port)
         self.host, self.port = host, int(self._socket.getsockname()[1])
         config = self._uvicorn.Config(
             AccessControl(application, self.token),
             log_level="warning",
-            ws_per_message_deflate=False,  # it costs more time than this computer's wire
+            ws_per_message_deflate=False,  # it costs more time than it saves on one computer
             ws_max_size=2**20,
             timeout_graceful_shutdown=1,
         )
@@ -94,25 +94,25 @@ class WebServer:
 
     @property
     def address(self) -> str:
-        """That a person opens."""
+        """The URL for a person to open."""
         return self.addresses[0]
 
     @property
     def addresses(self) -> tuple[str, ...]:
-        """All that a person may open.
+        """All URLs for a person to open.
 
-        Where it listens everywhere that is this computer's name, and, since others may not know
-        that name, the number by which the network knows the computer.
+        For a server that listens at every address they have this computer's name, and its IP
+        address in the network, as other computers may not know the name.
         """
         hosts = [self.host]
         if self.host in ("0.0.0.0", "::", ""):
-            hosts = [socket.gethostname(), *_outward()]
+            hosts = [socket.gethostname(), *_find_own_address()]
         token = f"?token={self.token}" if self.token else ""
         shown = (f"[{host}]" if ":" in host else host for host in hosts)
         return tuple(f"http://{host}:{self.port}/{token}" for host in shown)
 
     def close(self) -> None:
-        """Serve no longer."""
+        """Stop the server."""
         self._server.should_exit = True
         self._thread.join(3.0)
         self._socket.close()
@@ -129,8 +129,8 @@ class WebServer:
         raise UsSimError(f"the web server at {self.host}:{self.port} did not start")
 
 
-def _outward() -> list[str]:
-    """The IP address from which this computer would send to others; none without a network."""
+def _find_own_address() -> list[str]:
+    """Return the IP address from which this computer sends to others; empty without a network."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
         try:
             asking.connect(("192.0.2.1", 9))  # an address for examples; nothing is sent
@@ -139,8 +139,9 @@ def _outward() -> list[str]:
         return [str(asking.getsockname()[0])]
 
 
-def _made(simulator: Simulator) -> tuple[Any, Any]:
-    # NiceGUI would make a folder of its own wherever the program was started.
+def _import_server(simulator: Simulator) -> tuple[Any, Any]:
+    """Return the module uvicorn, and the application; raise UsSimError if a package is missing."""
+    # NiceGUI would make a folder of its own in the working directory.
     os.environ.setdefault("NICEGUI_STORAGE_PATH", str(cache_folder() / "viewer"))
     try:
         import uvicorn
@@ -153,12 +154,8 @@ def _made(simulator: Simulator) -> tuple[Any, Any]:
     return uvicorn, make_application(simulator)
 
 
-def _checked(token: str) -> str:
-    """That token, or none.
-
-    Raises:
-        UsSimError: it will not do.
-    """
+def _check_token(token: str) -> str:
+    """Return the token, which may be ""; raise if it is too short or has other characters."""
     if token and not re.fullmatch(r"[A-Za-z0-9_.~-]{16,}", token):
         raise UsSimError(
             "the viewer's token must have 16 letters, digits, or characters of _.~- at least: set "

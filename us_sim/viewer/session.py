@@ -1,4 +1,4 @@
-"""The session as pages see it: the running scene, what can be loaded and played, and requests.
+"""The session for pages: the running scene, scenes to load, recordings to play, and requests.
 
 >>> from us_sim.viewer.session import SessionBoard
 >>> board = SessionBoard()
@@ -34,56 +34,56 @@ NOT_THERE = "us-sim does not run this simulation, so nothing can be loaded or re
 class SessionState:
     """State of the simulation: its scene, recording and replay, named as in its report."""
 
-    is_there: bool = False  # whether somebody answers for it
+    is_there: bool = False  # us-sim runs the simulation and reports
     state: str = ""  # for a person
     scene: str = ""
-    origin: str = ""  # what loads it
-    fraction: float = 1.0  # of loading or starting that is done
-    problem: str = ""  # why the last thing that was asked for came to nothing
-    record: str = ""  # file that is recorded to, with its folder
-    record_state: str = ""  # of its recorder: starting, recording, paused
-    record_note: str = ""  # what is to be known of that file
-    record_seconds: float = 0.0  # since when
-    record_bytes: float = 0.0  # its size so far
-    record_room_bytes: float = 0.0  # what is left
+    origin: str = ""  # file, name or case from which the scene was loaded
+    fraction: float = 1.0  # done of loading or starting
+    problem: str = ""  # reason why the last request failed
+    record: str = ""  # file of the recording, with its folder
+    record_state: str = ""  # of the recorder: starting, recording, paused
+    record_note: str = ""  # a remark on the file
+    record_seconds: float = 0.0  # duration so far
+    record_bytes: float = 0.0  # size so far
+    record_room_bytes: float = 0.0  # free space
     replay: str = ""  # bag that is played
     replay_as: str = "path"
     replay_state: str = ""
     replay_rate: float = 1.0  # speed factor
     replay_loop: bool = False
-    replay_paused: bool = False  # as it was asked for, also before it begins
+    replay_paused: bool = False  # as asked for, also before the replay begins
     position: float = 0.0  # s, in the replay
     duration: float = 0.0  # s
 
     @property
     def is_busy(self) -> bool:
-        """Whether a scene is being loaded, or nodes are starting."""
+        """True while a scene loads or nodes start."""
         return self.fraction < 1.0
 
     @property
     def is_recording(self) -> bool:
-        """Whether the recorder says that it writes."""
+        """True while the recorder reports that it writes."""
         return bool(self.record) and self.record_state == "recording"
 
     @property
     def is_starting(self) -> bool:
-        """Whether a replay does not play yet."""
+        """True from the request of a replay until it plays."""
         return bool(self.replay) and self.replay_state in ("starting", "waiting")
 
     @property
     def is_playing(self) -> bool:
-        """Whether the replay goes on, or will as soon as it is ready."""
+        """True while the replay goes on, or will go on as soon as it is ready."""
         is_awaited = self.is_starting and not self.replay_paused
         return is_awaited or self.replay_state == "playing"
 
     @classmethod
     def from_status(cls, status: DiagnosticStatus) -> SessionState:
         """Read the report of `session_control`."""
-        said = {each.key: each.value for each in status.values}
-        values: dict[str, Any] = {"is_there": True, "state": said.get("state", status.message)}
+        texts = {each.key: each.value for each in status.values}
+        values: dict[str, Any] = {"is_there": True, "state": texts.get("state", status.message)}
         values["problem"] = status.message if status.level != DiagnosticStatus.OK else ""
         for each in fields(cls):
-            text = said.get(each.name)
+            text = texts.get(each.name)
             if text is None or each.name in values:
                 continue
             if isinstance(each.default, bool):
@@ -97,14 +97,14 @@ class SessionState:
 
 
 class SessionBoard(PageCounter):
-    """The newest that is known of the session, and who shows it; for any thread.
+    """The newest state of the session, and the pages that show it; for any thread.
 
     Args:
-        on_watch: called when pages begin to show it, or no longer do.
-        send: sets parameters of ``session_control`` together; the future holds why not, or nothing.
-        folder: to which pages record; "" is the one that us-sim runs in.
-        is_own: whether all pages are this computer's own; others may ask for what is listed, and
-            for recordings in that folder, and not for files anywhere.
+        on_watch: called when the first page shows it, and when the last has gone.
+        send: sets parameters of ``session_control`` together; the future holds the refusal, or "".
+        folder: in which pages record; "" is the one in which us-sim runs.
+        is_own: all pages are of this computer; pages of others may load and play only what is
+            listed, and record only in the folder.
     """
 
     def __init__(
@@ -123,8 +123,8 @@ class SessionBoard(PageCounter):
         self.bags: Mapping[str, str] = {}  # files that can be played, by name
 
     def ask_control(self, **values: object) -> Future[str]:
-        """Set parameters of ``session_control``; the future holds why not, or nothing."""
-        refusal = "" if self._is_own else self._refusal(values)
+        """Set parameters of ``session_control``; the future holds the refusal, or ""."""
+        refusal = "" if self._is_own else self._find_refusal(values)
         if self._send_to_control is not None and self.state.is_there and not refusal:
             file = values.get("record")
             if self.folder and file:
@@ -132,8 +132,8 @@ class SessionBoard(PageCounter):
             return self._send_to_control(values)
         return make_answer(refusal or NOT_THERE)
 
-    def _refusal(self, values: Mapping[str, object]) -> str:
-        """Why pages of other computers may not ask for this; "" where they may."""
+    def _find_refusal(self, values: Mapping[str, object]) -> str:
+        """Return why a page of another computer may not ask for this; "" if it may."""
         file = str(values.get("record") or "")
         if PurePath(file).name != file or file.startswith(("~", "..")):
             return f"record: {file}: give a name without a folder"
@@ -150,17 +150,17 @@ class SessionBoard(PageCounter):
 
 CONTROL = "session_control"
 _EVERY_S = 0.5
-SILENT_S = 3.0
-"""Without a word, after which nobody answers for the simulation: it says something every second."""
+SILENT_S = 3.0  # without a report, after which us-sim counts as gone: it reports every second
 
 
 class ViewerSession(SessionBoard):
     """A board that follows the session's topics while a page shows it, and asks `session_control`.
 
     Args:
-        node: that listens.
-        post: has work done in the thread that spins ``node``.
-        folder, is_own: as for `SessionBoard`.
+        node: the node that subscribes.
+        post: runs calls in the node's thread.
+        folder: as for `SessionBoard`.
+        is_own: as for `SessionBoard`.
     """
 
     def __init__(
@@ -185,7 +185,7 @@ class ViewerSession(SessionBoard):
         self._client: AsyncParameterClient | None = None
         self._heard = 0.0
         self.on_other_scene: Callable[[], None] = lambda: None
-        """Called in the node's thread when another scene takes the place of one."""
+        """Called in the node's thread when another scene is loaded."""
 
     def _listen(self) -> None:
         if self.is_watched and self._client is None:
@@ -202,13 +202,13 @@ class ViewerSession(SessionBoard):
                     self.on_other_scene()
 
     def _take_scenes(self, message: DiagnosticArray) -> None:
-        self.scenes = tuple(map(_scene_of, message.status))
+        self.scenes = tuple(map(_read_scene, message.status))
 
     def _take_bags(self, message: DiagnosticArray) -> None:
         self.bags = {loggable_text(status.name): status.hardware_id for status in message.status}
 
     def _check(self) -> None:
-        """Notice when nobody answers for the simulation any more."""
+        """Forget the state when us-sim has been silent for long."""
         if self.state.is_there and time.monotonic() - self._heard > SILENT_S:
             self.state = SessionState()
 
@@ -218,25 +218,25 @@ class ViewerSession(SessionBoard):
         return set_atomically(self._client, [Parameter(n, value=v) for n, v in values.items()])
 
 
-def _scene_of(status: DiagnosticStatus) -> ListedScene:
+def _read_scene(status: DiagnosticStatus) -> ListedScene:
     about = {each.key: loggable_text(each.value) for each in status.values}
     is_wrong = status.level != DiagnosticStatus.OK
-    said = loggable_text(status.message)
+    message = loggable_text(status.message)
     return ListedScene(
         loggable_text(status.name),
         status.hardware_id,
         about.get("kind", "scene"),
-        "" if is_wrong else said,
+        "" if is_wrong else message,
         about.get("region", ""),
-        _names(about.get("structures", "")),
+        _read_names(about.get("structures", "")),
         about.get("probe", ""),
         about.get("tracker", ""),
-        said if is_wrong else "",
+        message if is_wrong else "",
     )
 
 
-def _names(text: str) -> tuple[str, ...]:
-    """The texts of a JSON list; none where it is no such list."""
+def _read_names(text: str) -> tuple[str, ...]:
+    """Read a JSON list of texts; empty if the text is no list."""
     try:
         listed = json.loads(text)
     except (ValueError, RecursionError):

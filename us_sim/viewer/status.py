@@ -24,7 +24,7 @@ from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, loggable_text
 from us_sim.nodes.qos import STREAM
 
 GONE_S = 3.0  # without a report, after which a node counts as gone: each reports every second
-FORGOTTEN_S = 60.0  # after which a node that is gone is not shown any more
+FORGOTTEN_S = 60.0  # without a report, after which a node is no longer listed
 
 
 class NodeLevel(Enum):
@@ -55,19 +55,19 @@ class NodeStatus:
 
     @property
     def state(self) -> str:
-        """Its activity, in words."""
+        """The node's activity, in words."""
         return self.values.get("state", self.message)
 
     @property
     def problems(self) -> int:
-        """Messages that it could not use, and exceptions."""
+        """Count of messages that the node could not use, and of exceptions."""
         counts = (
             self.read_number(key) for key in self.values if key.startswith(("rejected", "failed"))
         )
         return sum(int(count or 0) for count in counts)
 
     def read_number(self, key: str) -> float | None:
-        """A finite number in its report, if there is one."""
+        """Return a number of the report; None if it is missing or not finite."""
         try:
             number = float(self.values[key])
         except (KeyError, ValueError):
@@ -79,7 +79,7 @@ class PageCounter:
     """Counts the pages that show something; for any thread.
 
     Args:
-        on_watch: called when pages begin to show it, or no longer do.
+        on_watch: called when the first page shows it, and when the last has gone.
     """
 
     def __init__(self, on_watch: Callable[[], None] = lambda: None) -> None:
@@ -89,15 +89,15 @@ class PageCounter:
 
     @property
     def is_watched(self) -> bool:
-        """Whether a page shows it."""
+        """True while a page shows it."""
         return self._pages > 0
 
     def add_page(self) -> None:
-        """One page more shows it."""
+        """Count a page more."""
         self._count(1)
 
     def remove_page(self) -> None:
-        """One page shows it no longer."""
+        """Count a page less."""
         self._count(-1)
 
     def _count(self, pages: int) -> None:
@@ -113,22 +113,22 @@ class StatusBoard(PageCounter):
     """The newest report of each node; for any thread.
 
     Args:
-        on_watch: called when pages begin to show it, or no longer do.
+        on_watch: called when the first page shows it, and when the last has gone.
     """
 
     def __init__(self, on_watch: Callable[[], None] = lambda: None) -> None:
         super().__init__(on_watch)
         self._nodes: dict[str, NodeStatus] = {}
-        self._since = 0.0  # s, monotonic, since when pages show it; nothing is heard before
+        self._since = 0.0  # s, monotonic, when the first page came; nothing is heard before
 
     def add_page(self) -> None:
-        """One page more shows it; nodes do not count as gone for the time in which none did."""
+        """Count a page more; nodes do not count as gone for the time without pages."""
         if not self.is_watched:
             self._since = time.monotonic()
         super().add_page()
 
     def add_report(self, status: NodeStatus, now: float) -> None:
-        """Keep a report, at a time of the monotonic clock in s."""
+        """Keep a report and the node's last problem; ``now`` is s of the monotonic clock."""
         with self._lock:
             before = self._nodes.get(status.name)
             if status.level is not NodeLevel.WELL:
@@ -142,7 +142,7 @@ class StatusBoard(PageCounter):
             )
 
     def list_nodes(self, now: float) -> list[NodeStatus]:
-        """The nodes by name, without those that have long been gone."""
+        """List the nodes by name, without those that are long gone."""
         with self._lock:
             known = sorted(self._nodes.values(), key=lambda status: status.name)
         return [
@@ -154,16 +154,16 @@ class StatusBoard(PageCounter):
         ]
 
     def find_node(self, name: str, now: float) -> NodeStatus | None:
-        """One node, if it ever reported."""
+        """Return a node; None if it never reported or is long gone."""
         return next((each for each in self.list_nodes(now) if each.name == name), None)
 
 
 class StatusListener(StatusBoard):
-    """A board that hears ``diagnostics`` while a page shows it.
+    """A board that subscribes to ``diagnostics`` while a page shows it.
 
     Args:
-        node: that listens.
-        post: has work done in the thread that spins ``node``.
+        node: the node that subscribes.
+        post: runs calls in the node's thread.
     """
 
     def __init__(self, node: GuardedNode, post: Callable[[Callable[[], Any]], Any]) -> None:

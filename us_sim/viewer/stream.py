@@ -1,4 +1,4 @@
-"""Streams to the pages: packets, feeds that make them while watched, and the side of one page.
+"""Streams to the pages: packets, feeds that make them while watched, and the streams of one page.
 
 >>> from us_sim.viewer.stream import Feed, Packet
 >>> packet = Packet("image", 7, {"rows": 1, "columns": 4}, bytes([0, 85, 170, 255]))
@@ -33,7 +33,7 @@ from us_sim.viewer.session import SessionBoard
 from us_sim.viewer.status import StatusBoard
 
 _LENGTH = struct.Struct("<I")
-_ALIGNMENT = 8  # bytes: the payload begins at a multiple, so that the page can read it as numbers
+_ALIGNMENT = 8  # bytes; at a multiple of it the page can read the payload as numbers
 _LONGEST = 65536  # characters of a page's message
 _numbers = itertools.count(1)
 ONLY_WATCHES = "This page only watches: open it without ?watch to change something"
@@ -41,16 +41,16 @@ ONLY_WATCHES = "This page only watches: open it without ?watch to change somethi
 
 @dataclass(frozen=True)
 class Packet:
-    """A message to the page: a header of JSON, and bytes."""
+    """A message to the page: a JSON header, and bytes."""
 
     kind: str  # the stream's name
-    sequence: int  # counts the messages of the stream
-    header: Mapping[str, Any]  # JSON-like, of finite numbers
+    sequence: int  # number of the message in the stream
+    header: Mapping[str, Any]  # of JSON's types, numbers finite
     payload: bytes
 
     @cached_property
     def encoded(self) -> bytes:
-        """As sent: length of the header (32 bits, little endian), header, payload."""
+        """The bytes to send: length of the header (32 bits, little endian), header, payload."""
         header = {"kind": self.kind, "sequence": self.sequence, **self.header}
         text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
         text += b" " * (-(_LENGTH.size + len(text)) % _ALIGNMENT)
@@ -58,7 +58,7 @@ class Packet:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Packet:
-        """The packet of :attr:`encoded`."""
+        """Decode the bytes of `encoded`."""
         (length,) = _LENGTH.unpack_from(data)
         header = json.loads(data[_LENGTH.size : _LENGTH.size + length])
         kind, sequence = header.pop("kind"), header.pop("sequence")
@@ -66,17 +66,17 @@ class Packet:
 
 
 Pack = Callable[[int], Packet | None]
-"""Makes the packet of a number; None where the message cannot be used."""
+"""Makes the packet with a sequence number; returns None if the message cannot be used."""
 
 
 class Feed:
-    """The newest of one stream: the graph offers, pages watch and take, each in its own thread.
+    """The newest packet of one stream; the node offers packets, pages take them, in any thread.
 
     Args:
-        kind: the stream's name, which its packets bear.
+        kind: the stream's name, in each of its packets.
         on_watch: called with True when the first page begins to watch and with False when the last
             has left, in the thread of that page.
-        rate: Hz, at most, for each page; None sends every packet, of things that are told once.
+        rate: Hz, largest rate for each page; None sends every packet.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class Feed:
         rate: float | None = 30.0,
     ) -> None:
         self.kind, self.rate = kind, rate
-        self.sequence = 0  # the number of the newest; 0 before the first
+        self.sequence = 0  # of the newest packet; 0 before the first
         self._on_watch = on_watch
         self._watchers: list[Callable[[], None]] = []
         self._lock = threading.Lock()
@@ -96,11 +96,11 @@ class Feed:
 
     @property
     def is_watched(self) -> bool:
-        """Whether any page watches."""
+        """True while a page watches."""
         return bool(self._watchers)
 
     def add_watcher(self, notify: Callable[[], None]) -> None:
-        """Have ``notify`` called, from any thread, whenever there is a newer packet."""
+        """Call ``notify`` for each newer packet, in the thread that offers it."""
         with self._lock:
             self._watchers.append(notify)
             first = len(self._watchers) == 1
@@ -116,7 +116,7 @@ class Feed:
             self._on_watch(False)
 
     def offer_packet(self, pack: Pack) -> None:
-        """Announce a newer packet, which ``pack`` makes if any page takes it."""
+        """Announce a newer packet; ``pack`` makes it when a page takes it."""
         with self._lock:
             self.sequence += 1
             self._pack = pack
@@ -130,7 +130,7 @@ class Feed:
             self._pack = None
 
     def get_newest(self) -> Packet | None:
-        """The newest packet, made once for all pages; None where there is none to be used."""
+        """Return the newest packet, made once for all pages; None without a usable one."""
         with self._packing:
             with self._lock:
                 sequence, pack = self.sequence, self._pack
@@ -143,21 +143,21 @@ class Feed:
 
 @dataclass
 class Simulator:
-    """The simulator as pages see it; filled by the node ``viewer``, or by a test."""
+    """The simulator as pages see it; the node ``viewer``, or a test, fills it."""
 
     feeds: dict[str, Feed] = field(default_factory=dict)  # by kind
     commands: dict[str, Callable[[Any, int], str | None]] = field(default_factory=dict)
-    """By the key of a page's message: takes the value and the page's number, returns an error."""
+    """By key of a page's message: takes value and page number, returns an error or None."""
     nodes: RemoteParameters = field(default_factory=RemoteParameters)
     status: StatusBoard = field(default_factory=StatusBoard)
     session: SessionBoard = field(default_factory=SessionBoard)
     ask_scorer: Callable[[str], object] = lambda _: None  # to "clear" or to "draw"
     leaving: list[Callable[[int], object]] = field(default_factory=list)
-    """Called with a page's number when it has gone."""
+    """Called with a page's number when the page has gone."""
 
     @property
     def is_changing_by_itself(self) -> bool:
-        """Whether a page watches blood or a strip of time, which go on while the probe rests."""
+        """True while a page watches blood or a strip of time, which also change at rest."""
 
         def watched(kind: str) -> bool:
             return kind in self.feeds and self.feeds[kind].is_watched
@@ -167,20 +167,20 @@ class Simulator:
         return colours or any(map(watched, STRIPS))
 
     def add_feeds(self, *feeds: Feed) -> None:
-        """Let pages watch these."""
+        """Add feeds that pages can watch."""
         self.feeds |= {feed.kind: feed for feed in feeds}
 
 
 class PageStream:
     """The streams that one page watches, and the packets that are due.
 
-    A page says what it watches and then, for each stream, when it has drawn what came: so the
-    newest is sent as soon as the page is ready, and a slow page gets fewer, not older ones.
+    A page tells which streams it watches and, for each, when it has drawn the last packet. It gets
+    the newest packet as soon as it is ready: a slow page gets fewer packets, not older ones.
 
     Args:
-        simulator: whose feeds and commands.
-        wake: called, from any thread, when something may be due.
-        only_watches: whether the page's commands are refused.
+        simulator: has the feeds and takes the commands.
+        wake: called, in any thread, when a packet may be due.
+        only_watches: refuse the page's commands.
     """
 
     def __init__(
@@ -192,10 +192,10 @@ class PageStream:
         self._watched: dict[str, Feed] = {}
         self._ready: set[str] = set()
         self._sent: dict[str, int] = {}
-        self._earliest: dict[str, float] = {}  # s, when the next may be sent
+        self._earliest: dict[str, float] = {}  # s, time before which the next must wait
 
     def obey_message(self, text: str) -> str | None:
-        """Obey a page's message; an error for a person, or None."""
+        """Obey a page's message; return an error for a person, or None."""
         try:
             message = json.loads(text) if len(text) <= _LONGEST else None
         except (ValueError, RecursionError):
@@ -203,12 +203,12 @@ class PageStream:
         if not isinstance(message, dict):
             return "what the page sent is no JSON object: load the page again"
         for key, value in message.items():
-            wrong = self._take(key, value)
-            if wrong:
-                return wrong
+            problem = self._obey(key, value)
+            if problem:
+                return problem
         return None
 
-    def _take(self, key: str, value: Any) -> str | None:
+    def _obey(self, key: str, value: Any) -> str | None:
         if key == "watch" and isinstance(value, list):
             self.watch_kinds([kind for kind in value if isinstance(kind, str)])
         elif key == "next" and isinstance(value, str):
@@ -222,7 +222,7 @@ class PageStream:
         return None
 
     def watch_kinds(self, kinds: list[str]) -> None:
-        """Watch these, and no others; kinds that are not known may come later."""
+        """Watch the streams of these kinds only; ignore unknown kinds, which may come later."""
         for kind in self._watched.keys() - set(kinds):
             self._watched.pop(kind).remove_watcher(self._wake)
         for kind in kinds:
@@ -235,35 +235,38 @@ class PageStream:
         self._wake()
 
     def collect_due(self, now: float) -> tuple[list[bytes], float | None]:
-        """The encoded packets to be sent now, and s until one that waits may be; None without.
+        """Collect the packets to send now.
 
         Args:
             now: s, of a monotonic clock.
+
+        Returns:
+            the encoded packets, and s until the next waiting one is due; None if none waits.
         """
-        packets, later = [], None
+        packets, shortest = [], None
         for kind, feed in self._watched.items():
             if kind not in self._ready or feed.sequence == self._sent[kind]:
                 continue
             wait = self._earliest.get(kind, now) - now
             if wait > 0:
-                later = wait if later is None else min(later, wait)
+                shortest = wait if shortest is None else min(shortest, wait)
                 continue
             packet = feed.get_newest()
             self._sent[kind] = feed.sequence if packet is None else packet.sequence
             if packet is not None:
                 self._ready.discard(kind)
-                if feed.rate:  # on the beat of the rate, and not sooner after a rest
+                if feed.rate:  # at even intervals; a pause does not earn packets ahead of time
                     beat = self._earliest.get(kind, now) + 1.0 / feed.rate
                     self._earliest[kind] = max(beat, now)
                 packets.append(packet.encoded)
-        return packets, later
+        return packets, shortest
 
 
 class CallPoster:
     """Runs calls from any thread in the node's thread, in order.
 
     Args:
-        node: that is spun, or will be.
+        node: the node that is spun, now or later.
     """
 
     def __init__(self, node: GuardedNode) -> None:
@@ -271,13 +274,13 @@ class CallPoster:
         self._work: deque[Callable[[], object]] = deque()
 
     def __call__(self, work: Callable[[], object]) -> None:
-        """Run it soon."""
+        """Run a call soon."""
         self._work.append(work)
         self._node.call_soon(self._run)
 
     def _run(self) -> None:
         if self._work:
             work = self._work.popleft()
-            if self._work:  # such as what was asked for before the node was spun
+            if self._work:  # calls from before the node was spun
                 self._node.call_soon(self._run)
             work()

@@ -1,4 +1,4 @@
-"""Surfaces as they go to a page: told once at rest, after which only positions travel.
+"""Surfaces for a page: sent once at rest, after which only positions travel.
 
 >>> import numpy as np
 >>> from us_sim.viewer.surfaces import StreamedSurface, weld_corners
@@ -27,13 +27,12 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.viewer.stream import Packet
 
 FINEST = 1e-6
-"""m, of a step: tissue may move by 33 mm before steps must be longer. Whole steps are half the
-bytes of single precision."""
+"""m, smallest step of positions: int16 steps reach 33 mm, in half the bytes of single precision."""
 
 
 @dataclass(frozen=True, eq=False)
 class ColouredSurface:
-    """A surface, and how it is shown."""
+    """A surface with its name and colour."""
 
     name: str
     colour: tuple[float, float, float]  # red, green, blue, 0 to 1
@@ -42,7 +41,7 @@ class ColouredSurface:
 
 
 def weld_corners(corners: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """Vertices (V, 3), each once, and triangles (T, 3), without those that have no area left.
+    """Merge equal corners to vertices (V, 3) and triangles (T, 3); drop triangles without an area.
 
     Args:
         corners: (3 T, 3) m, three of each triangle in a row.
@@ -52,37 +51,39 @@ def weld_corners(corners: NDArray[np.floating]) -> tuple[NDArray[np.float64], ND
     is_new = np.insert((ordered[1:] != ordered[:-1]).any(axis=1), 0, values=True)
     numbers = np.empty(len(corners), dtype=np.intp)
     numbers[order] = np.cumsum(is_new) - 1
-    return ordered[is_new], _with_area(numbers.reshape(-1, 3))
+    return ordered[is_new], _drop_flat(numbers.reshape(-1, 3))
 
 
 def cluster_vertices(
     vertices: NDArray[np.floating], triangles: NDArray[np.integer], cell: float
 ) -> NDArray[np.integer]:
-    """(F, 3) triangles of the same vertices that are left when vertices are merged.
+    """Merge the vertices in each cell of a grid into one; return the triangles left, (F, 3).
 
-    Vertices are merged in the cells of a grid (J. Rossignac and P. Borrel, "Multi-resolution 3D
-    approximations for rendering complex scenes", 1993), each cell into one of them: so they are
-    vertices of the surface itself, also in a deformed state. A closed surface stays closed: as a
-    sum of oriented triangles it has no edge left over.
+    Vertex clustering after J. Rossignac and P. Borrel, "Multi-resolution 3D approximations for
+    rendering complex scenes", 1993. All vertices are ones of the surface, so they also serve a
+    deformed state. A closed surface stays closed: a sum of oriented triangles without a border.
 
     Args:
-        vertices: (V, 3) m. triangles: (T, 3).
-        cell: m, side of the cells of the grid.
+        vertices: (V, 3) m.
+        triangles: (T, 3) indices into vertices.
+        cell: m, side of the grid's cells.
     """
     used, corners = np.unique(triangles, return_inverse=True)
     points = vertices[used]
     grid = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
     _, first, cells = np.unique(grid, axis=0, return_index=True, return_inverse=True)
-    return _with_area(used[first][cells.ravel()][corners.ravel()].reshape(-1, 3))
+    return _drop_flat(used[first][cells.ravel()][corners.ravel()].reshape(-1, 3))
 
 
 def simplify_surface(
     vertices: NDArray[np.floating], triangles: NDArray[np.integer], count: int
 ) -> NDArray[np.integer]:
-    """About ``count`` triangles or fewer of a surface, all where it has no more.
+    """Reduce a surface to ``count`` triangles or somewhat fewer.
 
     Args:
-        vertices: (V, 3) m. triangles: (T, 3).
+        vertices: (V, 3) m.
+        triangles: (T, 3) indices into vertices.
+        count: largest number of triangles.
     """
     sides = vertices[triangles] - vertices[np.roll(triangles, 1, axis=1)]
     cell, fewer = 0.5 * float(np.linalg.norm(sides, axis=2).mean()), triangles
@@ -92,18 +93,18 @@ def simplify_surface(
     return fewer
 
 
-def _with_area(triangles: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The triangles of three different vertices."""
+def _drop_flat(triangles: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return the triangles of three different vertices."""
     return triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
 
 
 class StreamedSurface:
-    """Points at rest with their triangles and edges, and packets of where they are later.
+    """Points at rest with their triangles and edges, and packets of their later positions.
 
     Args:
         points: (N, 3) m, at rest.
         triangles: (T, 3) indices into points.
-        edges: (E, 2) likewise, of lines to draw.
+        edges: (E, 2) indices into points, of lines to draw.
     """
 
     def __init__(
@@ -119,18 +120,18 @@ class StreamedSurface:
         self._edges = np.ascontiguousarray(lines, dtype=np.uint32)
         parts = (self.points, self._triangles, self._edges)
         self._payload = b"".join(part.tobytes() for part in parts)
-        #: By which packets name the surface that they move.
+        #: Checksum by which packets name the surface that they move.
         self.number = zlib.crc32(self._payload)
 
     @classmethod
     def from_mesh(cls, mesh: TetrahedralMesh) -> StreamedSurface:
-        """All nodes of a mesh with its outer faces, and their edges, each once."""
+        """Make a surface of all nodes of a mesh, its outer faces, and their edges."""
         faces = mesh.boundary
         edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
         return cls(mesh.nodes, faces, np.unique(edges, axis=0))
 
     def make_rest_packet(self, kind: str, sequence: int) -> Packet:
-        """All of it at rest: points as float32, then triangles and edges as uint32."""
+        """Make the packet of the rest: points as float32, then triangles and edges as uint32."""
         header = {
             "mesh": self.number,
             "points": len(self.points),
@@ -142,10 +143,16 @@ class StreamedSurface:
     def make_packet(
         self, positions: NDArray[np.floating], *, kind: str, sequence: int, stamp: int
     ) -> Packet:
-        """Where the points are now (N, 3) m, as int16 steps from rest; ``stamp`` in ns.
+        """Make the packet of present positions, as int16 steps from rest.
+
+        Args:
+            positions: (N, 3) m.
+            kind: the stream's name.
+            sequence: number of the packet.
+            stamp: ns.
 
         Raises:
-            MeshError: there are more or fewer than at rest.
+            MeshError: there are more or fewer points than at rest.
         """
         if positions.shape != self.points.shape:
             raise MeshError(
@@ -166,17 +173,17 @@ class StreamedSurface:
 
 
 class CarriedSurfaces:
-    """Surfaces that move with the tissue's nodes: in which tetrahedron each vertex lies.
+    """Surfaces that move with the tissue's nodes.
 
-    A vertex is the sum of the tetrahedron's four nodes in barycentric weights, which do not change
-    while the tissue deforms. So vessels of forty thousand triangles cost nothing beyond the nodes
-    that travel for the tissue anyway, and the page computes where they are. Vertices
-    that are drawn while something moves come first.
+    A vertex is the barycentric sum of the four nodes of its tetrahedron, and its weights do not
+    change while the tissue deforms. So the page moves vessels of forty thousand triangles with the
+    nodes that it gets for the tissue anyway. The vertices of the coarse triangles come first: the
+    page draws only these while something moves.
 
     Args:
-        mesh: of the tissue, in the state in which the surfaces are as they are here.
+        mesh: of the tissue, in the same state as the surfaces.
         surfaces: at least one.
-        triangles: of all together, at most, while something moves.
+        triangles: largest number of coarse triangles of all surfaces together.
 
     Raises:
         MeshError: a surface is not in the tissue.
@@ -212,16 +219,18 @@ class CarriedSurfaces:
         #: (V, 4) nodes of the tissue that carry a vertex, and (V, 4) their weights, which sum to 1.
         self.nodes = mesh.tetrahedra[location.tetrahedra].astype(np.uint32)
         self.weights = location.weights.astype(np.float32)
-        self.moving = len(first_drawn)  # vertices that are drawn while something moves
+        self.moving = len(first_drawn)  # number of vertices of the coarse triangles
         self.fine = [number[part] for part in fine]
         self.coarse = [number[part] for part in coarse]
         self._surfaces = [(surface.name, surface.colour) for surface in surfaces]
 
     def make_rest_packet(self, kind: str, sequence: int, mesh: int) -> Packet:
-        """Nodes as uint32, weights as float32, then each part's triangles, all and fewer.
+        """Make a packet of nodes (uint32), weights (float32), and triangles, fine and coarse.
 
         Args:
-            mesh: the number of the tissue's mesh, whose nodes move them.
+            kind: the stream's name.
+            sequence: number of the packet.
+            mesh: number of the tissue's mesh, whose nodes move the surfaces.
         """
         parts = [
             {"name": name, "colour": list(colour), "fine": len(fine), "coarse": len(coarse)}
@@ -238,26 +247,28 @@ class CarriedSurfaces:
 def make_transducer_packet(
     kind: str, sequence: int, parts: Sequence[ColouredSurface], outline: NDArray[np.floating]
 ) -> Packet:
-    """Vertices as float32 and triangles as uint32 of each part, then the outline as float32.
+    """Make a packet of each part's vertices (float32) and triangles (uint32), then the outline.
 
     Args:
-        parts: in frame ``probe``.
+        kind: the stream's name.
+        sequence: number of the packet.
+        parts: surfaces in frame ``probe``.
         outline: (P, 3) m, as of `us_sim.slicing.probe.probe.compute_image_outline`.
     """
-    told, arrays = [], list[NDArray[np.generic]]()
+    described, arrays = [], list[NDArray[np.generic]]()
     for part in parts:
         sizes = {"vertices": len(part.vertices), "triangles": len(part.triangles)}
-        told.append({"name": part.name, "colour": list(part.colour), **sizes})
+        described.append({"name": part.name, "colour": list(part.colour), **sizes})
         arrays += [part.vertices.astype(np.float32), part.triangles.astype(np.uint32)]
     payload = b"".join(array.tobytes() for array in (*arrays, outline.astype(np.float32)))
-    return Packet(kind, sequence, {"parts": told, "outline": len(outline)}, payload)
+    return Packet(kind, sequence, {"parts": described, "outline": len(outline)}, payload)
 
 
 class EquivalentStrain:
     """Equivalent (von Mises) strain of the states of one mesh, at its nodes.
 
-    sqrt(2/3 e : e) with e the deviator of the Green-Lagrange strain, which is the elongation in
-    uniaxial stretch at constant volume, to first order (Holzapfel, *Nonlinear Solid Mechanics*,
+    The strain is sqrt(2/3 e : e) with e the deviator of the Green-Lagrange strain: to first order
+    the elongation in uniaxial stretch at constant volume (Holzapfel, *Nonlinear Solid Mechanics*,
     2000). A node has the mean of its tetrahedra, weighted by their volumes at rest.
     """
 
@@ -271,7 +282,7 @@ class EquivalentStrain:
         )
 
     def compute_strain(self, nodes: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(N,) when the mesh's nodes are at (N, 3) m; 0 is without strain."""
+        """Compute the strain (N,) with the mesh's nodes at (N, 3) m."""
         corners = nodes[self._tetrahedra]
         gradient = self._inverse @ (corners[:, 1:] - corners[:, :1])  # the transpose of F
         strain = 0.5 * (gradient @ gradient.transpose(0, 2, 1) - np.eye(3))

@@ -1,4 +1,4 @@
-"""The node ``viewer``: shows the simulator in a browser, and lets a person there take the probe."""
+"""The node ``viewer``: it shows the simulator in a browser, where a person can take the probe."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from us_sim.viewer.status import StatusListener
 from us_sim.viewer.stream import CallPoster, Simulator
 
 _IMAGED_WITH = ("gain", "dynamic_range", "focus")
-"""Parameters of ``slice_interpolator`` that pages are told with each image."""
+"""Parameters of ``slice_interpolator`` in the header of each image."""
 
 
 class Viewer(GuardedNode):
-    """A web server beside a node that subscribes only to topics that a page shows."""
+    """A web server, and a node that subscribes only to topics that a page shows."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("viewer", **kwargs)
@@ -57,7 +57,7 @@ class Viewer(GuardedNode):
         structures = StructuresFeed(self, post, rest)
         self._session.on_other_scene = structures.forget_structures
         self.simulator.add_feeds(
-            *make_image_feeds(self, post, settings.rate, self._known, self._arranged),
+            *make_image_feeds(self, post, settings.rate, self._describe, self._read_arrangement),
             *SkinFeeds(self, post, settings.rate).feeds,
             *self._probe.feeds,
             *TissueFeeds(self, post, settings.rate, rest).feeds,
@@ -79,20 +79,20 @@ class Viewer(GuardedNode):
     def _imaging(self) -> Mapping[str, Parameter]:
         return self._remote.get_node("slice_interpolator").parameters
 
-    def _arranged(self) -> tuple[bool, bool]:
+    def _read_arrangement(self) -> tuple[bool, bool]:
+        """Return the parameters ``flip`` and ``beside``; False while they are unknown."""
         flip, beside = map(self._imaging.get, ("flip", "beside"))
         return flip is not None and bool(flip.raw), beside is not None and bool(beside.raw)
 
-    def _known(self, stamp: int) -> dict[str, Any]:
-        """The scene, and how the probe was at the stamp (ns) of an image, for its header.
+    def _describe(self, stamp: int) -> dict[str, Any]:
+        """Return the scene and the probe's press and force at an image's stamp (ns), in m and N.
 
-        m and N; settings in the unit that a person reads. ``command`` is the page, and its number
-        for it, of the last command that is seen in the image, so that the page can tell how long
-        that took.
+        Settings are in the unit that a person reads. ``command`` is the last command that the image
+        contains: its page, and the page's number of it, by which the page measures the delay.
         """
         probe = self._probe.find_pose_and_wrench(str(stamp))
         parameters = self._imaging
-        told = {
+        known = {
             **self._hand.describe_pose(stamp, probe.get("position")),
             "force": float(np.linalg.norm(probe["force"])) if "force" in probe else None,
             "scene": self._session.state.scene or None,
@@ -102,10 +102,10 @@ class Viewer(GuardedNode):
                 if (parameter := parameters.get(name)) is not None and parameter.value is not None
             },
         }
-        return {name: value for name, value in told.items() if value is not None}
+        return {name: value for name, value in known.items() if value is not None}
 
     def destroy_node(self) -> None:
-        """End the web server first."""
+        """Stop the web server, then destroy the node."""
         self._server.close()
         super().destroy_node()
 

@@ -1,1 +1,1 @@
-"""The panels of the page: one a file, each built inside the page."""
+"""Panels of the page, each built inside the page."""

@@ -1,4 +1,4 @@
-"""What a page asks of nodes and of the session: one that only watches is refused all of it."""
+"""Requests of a page to nodes and to the session; a page that only watches is refused."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from us_sim.viewer.stream import ONLY_WATCHES
 
 
 def find_refusal() -> str:
-    """Say why the page at work may change nothing; "" where it may."""
+    """Return why the page may change nothing; "" if it may."""
     request = ui.context.client.request
     return ONLY_WATCHES if request is not None and "watch" in request.query_params else ""
 
 
 def enable_control(control: DisableableElement, is_on: bool = True) -> None:
-    """Let a control be used, or not; on a page that only watches never, and its title says why."""
+    """Enable or disable a control; a page that only watches has it disabled, with the reason."""
     reason = find_refusal()
     control.set_enabled(is_on and not reason)
     if reason and control.props.get("title") != reason:
@@ -27,17 +27,17 @@ def enable_control(control: DisableableElement, is_on: bool = True) -> None:
 
 
 async def set_parameter(node: NodeParameters, name: str, value: Any) -> str:
-    """Set a parameter as `NodeParameters.set_value` does; return why it was refused, or nothing."""
+    """Set a parameter, see `NodeParameters.set_value`; return the refusal, or ""."""
     return find_refusal() or await node.set_value(name, value)
 
 
 async def ask_session(board: SessionBoard, **values: object) -> str:
-    """Set parameters of ``session_control``; return why it was refused, or nothing."""
+    """Set parameters of ``session_control``; return the refusal, or ""."""
     return find_refusal() or await await_answer(board.ask_control(**values), CONTROL)
 
 
 def is_taken(refusal: str) -> bool:
-    """Return whether nothing was refused; tell the person why something was."""
+    """Show a refusal to the person, if there is one; return whether there is none."""
     if refusal:
         ui.notify(refusal, type="warning", multi_line=True)
     return not refusal

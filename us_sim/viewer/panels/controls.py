@@ -1,4 +1,4 @@
-"""Controls of parameters, each made from the parameter's descriptor.
+"""Controls of parameters, made from the parameters' descriptors.
 
 >>> from us_sim.viewer.panels.controls import resample_gains, choose_slider_span
 >>> choose_slider_span(-60.0, 60.0, 6.0)
@@ -28,13 +28,13 @@ from us_sim.viewer.remote_parameters import NodeParameters
 
 
 class WhileShown(Element, component="while_shown.js"):
-    """A part of the page that is kept up to date only while a person can see it.
+    """A part of the page that is refreshed only while a person can see it.
 
     Args:
-        begin: called when a person begins to see it.
+        begin: called when the part comes into view.
         end: called when another tab is chosen, the drawer is closed, or the browser has gone.
-        every: s between two calls of ``refresh`` while it is seen, the first at once.
-        refresh: brings it up to date.
+        every: s between two calls of ``refresh`` while the part is seen; the first is at once.
+        refresh: brings the part up to date.
     """
 
     def __init__(
@@ -53,11 +53,11 @@ class WhileShown(Element, component="while_shown.js"):
         self.on("shown", lambda event: self._show(bool(event.args)))
         self.client.on_disconnect(lambda: self._show(False))
         self.client.on_delete(lambda: self._show(False))
-        # A page that was away for a moment does not know that it was.
+        # A page that was disconnected for a moment does not know that it was.
         self.client.on_connect(lambda: self.run_method("again"))
 
     def stop_showing(self) -> None:
-        """End before it is taken off the page."""
+        """End before the part is removed from the page."""
         self._show(False)
 
     def _show(self, is_shown: bool) -> None:
@@ -70,14 +70,14 @@ class WhileShown(Element, component="while_shown.js"):
             self._refresh()
 
 
-_BY_FACTORS = 50.0  # from the smallest number to the largest: beyond, a slider goes by factors
-_WIDE = 1000.0  # likewise: beyond, a slider covers what is near the present value
-_AROUND = 100.0  # times the present value, and a hundredth of it, where a slider goes by factors
-_ROOM = 4.0  # times the present value, where a slider begins at zero
+_BY_FACTORS = 50.0  # ratio of the range's ends beyond which a slider is logarithmic
+_WIDE = 1000.0  # ratio beyond which a slider covers only the surroundings of the present value
+_AROUND = 100.0  # factor by which a logarithmic slider goes beyond the present value
+_ROOM = 4.0  # factor by which a linear slider goes beyond the present value
 _STEPS = 600
 _FROM_ZERO = {"mmHg": 30.0}
-"""By units that people set in whole numbers: how far a slider reaches at least."""
-_NOTHING = 1e-12  # of the range: a smaller value is zero on a slider
+"""Least reach of a slider, by units that people set in whole numbers."""
+_NOTHING = 1e-12  # of the range; a smaller value is zero on a slider
 
 
 @dataclass(frozen=True)
@@ -86,32 +86,32 @@ class SliderSpan:
 
     low: float
     high: float
-    step: float  # 0 where it goes by factors
+    step: float  # 0 for a logarithmic slider
     is_logarithmic: bool
 
     def has_value(self, value: float | None) -> bool:
-        """Whether a value can be shown on it; nothing can."""
+        """Return whether the slider can show a value; None, for nothing, it can."""
         return value is None or self.low <= value <= self.high
 
 
 def choose_slider_span(
     low: float, high: float, value: float | None, is_whole: bool = False, unit: str = ""
 ) -> SliderSpan | None:
-    """The span of a slider around a value; None where no slider makes sense.
+    """Choose the span of a slider around a value; None where no slider makes sense.
 
     Args:
-        low, high: the range, in the unit that is shown.
-        value: at present; None is nothing.
-        is_whole: only whole numbers will do.
-        unit: of all these.
+        low: least valid number.
+        high: largest valid number.
+        value: present value; None is nothing.
+        is_whole: only whole numbers are valid.
+        unit: of these numbers.
     """
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         return None
     if unit in _FROM_ZERO:
-        from_here = max(low, value or 0.0)
-        reach = _FROM_ZERO[unit]
-        high = min(high, reach if from_here < reach else _round_number(2.0 * from_here))
-        return SliderSpan(low, high, max(1.0, _round_number((high - low) / _STEPS)), False)
+        present, reach = max(low, value or 0.0), _FROM_ZERO[unit]
+        high = min(high, reach if present < reach else _round_up(2.0 * present))
+        return SliderSpan(low, high, max(1.0, _round_up((high - low) / _STEPS)), False)
     if low > 0.0 and high / low > _BY_FACTORS and not is_whole:
         if value and value > 0.0 and high / low > _WIDE:
             low, high = max(low, value / _AROUND), min(high, value * _AROUND)
@@ -120,31 +120,31 @@ def choose_slider_span(
     if value and abs(value) < _NOTHING * reach:
         value = 0.0
     if value and reach > _WIDE * abs(value):
-        end = _round_number(_ROOM * abs(value))
+        end = _round_up(_ROOM * abs(value))
         low, high = max(low, -end), min(high, end)
     elif is_whole and value and high - low > _WIDE:
-        high = min(high, _round_number(_ROOM * abs(value)))
+        high = min(high, _round_up(_ROOM * abs(value)))
     if (high - low) / _STEPS < sys.float_info.min:
         return None
-    step = 1.0 if is_whole else _round_number((high - low) / _STEPS)
+    step = 1.0 if is_whole else _round_up((high - low) / _STEPS)
     return SliderSpan(low, high, step, False)
 
 
-def _round_number(number: float) -> float:
-    """The next of 1, 2, 5 times a power of ten that is not smaller."""
+def _round_up(number: float) -> float:
+    """Round up to 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(number))
     factor = next(f for f in (1.0, 2.0, 5.0, 10.0) if f * power >= number * (1.0 - 1e-9))
     return float(f"{factor * power:.6g}")
 
 
 class ParameterControl(Element, component="parameter_control.js"):
-    """A slider with a number field, a choice, a switch, or a text; read-only ones are shown.
+    """A slider with a number field, a choice, a switch, or a text; read-only values are shown.
 
-    It sets one value at a time, and of several the last.
+    It sends one value at a time; of several values that wait, the last.
 
     Args:
-        node: whose parameter it is.
-        parameter: as it is now.
+        node: the node's parameters.
+        parameter: the parameter to control, as it is now.
         label: in place of the parameter's own.
     """
 
@@ -152,7 +152,7 @@ class ParameterControl(Element, component="parameter_control.js"):
         super().__init__()
         self.parameter = parameter
         self._node = node
-        self._wanted: tuple[Any, int] | None = None  # a value, and the number of the change
+        self._wanted: tuple[Any, int] | None = None  # a value to send, and the page's number of it
         self._is_asking = False
         self._span: SliderSpan | None = None
         self.props.update({"label": label or parameter.label, "tip": describe_parameter(parameter)})
@@ -166,7 +166,7 @@ class ParameterControl(Element, component="parameter_control.js"):
         if parameter == self.parameter:
             return
         if parameter.raw != self.parameter.raw:
-            self.props["reason"] = ""  # of another value
+            self.props["reason"] = ""  # it was another value's
         self.parameter = parameter
         self._show()
 
@@ -190,7 +190,7 @@ class ParameterControl(Element, component="parameter_control.js"):
     def _show(self) -> None:
         parameter = self.parameter
         value = parameter.value
-        self._fit(value)
+        self._choose_span(value)
         span = asdict(self._span) if self._span else None
         self.props.update(
             {
@@ -207,48 +207,43 @@ class ParameterControl(Element, component="parameter_control.js"):
         )
         self.update()
 
-    def _fit(self, value: Any) -> None:
-        """Have the slider cover the value, with room to go on where the range has some."""
-        low, high = self.parameter.low, self.parameter.high
-        if (
-            self.parameter.kind not in (ParameterKind.NUMBER, ParameterKind.WHOLE)
-            or low is None
-            or high is None
-        ):
+    def _choose_span(self, value: Any) -> None:
+        """Choose another span if the value is outside, or at an end where the range goes on."""
+        parameter, span = self.parameter, self._span
+        low, high, kind = parameter.low, parameter.high, parameter.kind
+        is_number = kind in (ParameterKind.NUMBER, ParameterKind.WHOLE)
+        if not is_number or low is None or high is None:
             self._span = None
             return
-        span = self._span
-        is_at_the_end = span is not None and (
-            (value == span.low != low) or (value == span.high != high)
-        )
-        if span is None or not span.has_value(value) or is_at_the_end:
-            is_whole = self.parameter.kind is ParameterKind.WHOLE
-            self._span = choose_slider_span(low, high, value, is_whole, self.parameter.unit)
+        is_at_end = span is not None and (value == span.low != low or value == span.high != high)
+        if span is None or not span.has_value(value) or is_at_end:
+            is_whole = kind is ParameterKind.WHOLE
+            self._span = choose_slider_span(low, high, value, is_whole, parameter.unit)
 
 
 def describe_parameter(parameter: Parameter) -> str:
-    """The description of a parameter, its range, and its full name."""
+    """Return the description of a parameter, its range, and its full name."""
     unit = f" {parameter.unit}" if parameter.unit else ""
-    said = [parameter.description] if parameter.description else []
+    parts = [parameter.description] if parameter.description else []
     if parameter.low is not None and parameter.high is not None:
-        said.append(f"{parameter.low:g} to {parameter.high:g}{unit}")
+        parts.append(f"{parameter.low:g} to {parameter.high:g}{unit}")
     if parameter.may_be_nothing:
-        said.append("empty for none")
+        parts.append("empty for none")
     if parameter.kind.is_list:
-        said.append("with commas between")
+        parts.append("with commas between")
     if not parameter.is_live:
-        said.append("given at the start")
-    said.append(f"{parameter.node}.{parameter.name}")
-    return "; ".join(said)
+        parts.append("given at the start")
+    parts.append(f"{parameter.node}.{parameter.name}")
+    return "; ".join(parts)
 
 
 def count_sliders(gains: Sequence[float]) -> int:
-    """One slider for each gain where those are 3 to 12, else 8, as consoles have."""
+    """Return one slider for each of 3 to 12 gains, else 8, as consoles have."""
     return len(gains) if 2 < len(gains) <= 12 else 8
 
 
 def resample_gains(gains: Sequence[float], count: int) -> list[float]:
-    """Gains at evenly spaced depths, linear in between, as so many sliders show them, dB."""
+    """Interpolate gains (dB) at evenly spaced depths to ``count`` sliders."""
     if not gains:
         return [0.0] * count
     places = np.linspace(0.0, 1.0, len(gains)) if len(gains) > 1 else np.zeros(1)
@@ -257,9 +252,9 @@ def resample_gains(gains: Sequence[float], count: int) -> list[float]:
 
 
 class TimeGainControl(ParameterControl, component="time_gain.js"):
-    """One slider for the gain in dB at each of some depths, from the face to the beams' end."""
+    """Sliders for the gain in dB at depths from the probe's face to the end of the beams."""
 
-    REACH = 20.0  # dB up and down that the sliders cover, as consoles have it
+    REACH = 20.0  # dB up and down that the sliders cover, as on consoles
 
     def __init__(self, node: NodeParameters, parameter: Parameter, label: str = "") -> None:
         self._count = count_sliders(parameter.value)
@@ -267,7 +262,7 @@ class TimeGainControl(ParameterControl, component="time_gain.js"):
         self.set_end(100.0, "%")
 
     def set_end(self, end: float, unit: str) -> None:
-        """The beams end at this depth."""
+        """Label the sliders with depths up to the end of the beams."""
         names = [f"{place:.0f} {unit}" for place in np.linspace(0.0, end, self._count)]
         if names != self.props.get("depths"):
             self.props["depths"] = names

@@ -1,4 +1,4 @@
-"""The panel of an exercise: which there are, the task, what is done of it, and the result."""
+"""The panel of exercises: their list, the task, its steps, and the result."""
 
 from __future__ import annotations
 
@@ -18,10 +18,8 @@ from us_sim.viewer.panels.session import ask_to_load, is_confirmed
 from us_sim.viewer.score import PICTURE, SCORE, get_score, is_blind
 from us_sim.viewer.stream import Feed, Simulator
 
-EVERY_S = 0.5
-"""How often the panel is brought up to date."""
-ANSWER_S = 30.0
-"""For a picture to be drawn: of an hour it takes seconds, on a busy computer more."""
+EVERY_S = 0.5  # between two refreshes of the panel
+ANSWER_S = 30.0  # for a picture: one of an hour takes seconds, on a busy computer more
 TITLE = "Exercise"
 NOTHING = "No exercise is followed: choose one."
 _LOOKS = {
@@ -29,26 +27,26 @@ _LOOKS = {
     "missed": ("Missed", "cancel"),
     "to do": ("To do", "radio_button_unchecked"),
 }
-"""Words and icons of Material's, by states of steps."""
+"""Words and icons of Material's, by state of a step."""
 _ALT = "The probe's way over the skin, with the force; force and areas of vessels over time"
 _SCORER = "scorer"
 
 
 class Hints(Element, component="hints.js"):
-    """What to do, for who sees the panel for the first time."""
+    """Instructions for a person who sees the panel for the first time."""
 
 
 class ExercisePanel:
-    """The panel of an exercise: every page shows the same, so that a teacher sees a learner's."""
+    """The panel of exercises; all pages show the same, so that a teacher sees the learner's."""
 
     def __init__(self, simulator: Simulator) -> None:
         self._simulator, self._board = simulator, simulator.session
         self._scorer = simulator.nodes.get_node(_SCORER)
         self._only_watches = bool(find_refusal())
         self._watched: list[Feed] = []
-        self._told: Mapping[str, Any] | None = None  # what is shown
+        self._score: Mapping[str, Any] | None = None  # that is shown
         self._listed: tuple[object, ...] = ()  # exercises that are shown
-        self._parts: dict[Element, Any] = {}  # of it, as they are drawn
+        self._parts: dict[Element, Any] = {}  # content of the panel's parts as drawn
         self._picture = b""
         with WhileShown(self._begin, self._end, EVERY_S, self._refresh):
             self._choice = ui.expansion("Exercises").classes("us-cases-more")
@@ -80,35 +78,35 @@ class ExercisePanel:
         feeds = self._simulator.feeds
         self._watched = [feeds[kind] for kind in (SCORE, PICTURE) if kind in feeds]
         for feed in self._watched:
-            feed.add_watcher(self._changed)
+            feed.add_watcher(self._ignore_packet)
         self._board.add_page()
         self._scorer.add_page()
 
     def _end(self) -> None:
         for feed in self._watched:
-            feed.remove_watcher(self._changed)
+            feed.remove_watcher(self._ignore_packet)
         self._board.remove_page()
         self._scorer.remove_page()
 
-    def _changed(self) -> None:
-        """Nothing: the panel looks twice a second."""
+    def _ignore_packet(self) -> None:
+        """Do nothing: the panel looks for packets twice a second."""
 
-    def _drawn(self) -> bytes:
+    def _get_picture(self) -> bytes:
         feed = self._simulator.feeds.get(PICTURE)
         packet = feed.get_newest() if feed is not None else None
         return packet.payload if packet is not None else b""
 
     def _refresh(self) -> None:
-        told = get_score(self._simulator)
-        if told != self._told:
-            self._told = told
-            self._show(told)
+        score = get_score(self._simulator)
+        if score != self._score:
+            self._score = score
+            self._show(score)
         exercises = [each for each in self._board.scenes if each.kind == "exercise"]
         listed = (*exercises, self._board.state.origin, self._board.state.is_busy)
         if listed != self._listed:
             self._listed = listed
             self._show_list(exercises)
-        picture = self._drawn() if told.get("name") else b""
+        picture = self._get_picture() if score.get("name") else b""
         if picture != self._picture or self._image.visible != bool(picture):
             self._picture = picture
             self._image.set_source(_address(picture) if picture else "")
@@ -131,28 +129,28 @@ class ExercisePanel:
         if await ask_to_load(self._simulator, exercise):
             self._choice.close()
 
-    def _show(self, told: Mapping[str, Any]) -> None:
-        name, steps = told.get("name", ""), told.get("steps", [])
+    def _show(self, score: Mapping[str, Any]) -> None:
+        name, steps = score.get("name", ""), score.get("steps", [])
         self._name.set_text(name or TITLE)
-        self._about.set_text(told["description"] if name else NOTHING)
+        self._about.set_text(score["description"] if name else NOTHING)
         self._hints.set_visibility(bool(steps))
         done = [step["state"] == "done" for step in steps]
-        seconds = next(iter(told.get("plain", {}).values()), "-")
+        seconds = next(iter(score.get("plain", {}).values()), "-")
         clock = f", {seconds} s" if seconds != "-" else ""
-        state = STATES[told.get("state", "to lift")]
-        is_asked = is_blind(told) and told["state"] == "running"
+        state = STATES[score.get("state", "to lift")]
+        is_asked = is_blind(score) and score["state"] == "running"
         asks = is_asked and not self._only_watches
-        count = "" if is_blind(told) else f": {sum(done)} of {len(done)} done"
+        count = "" if is_blind(score) else f": {sum(done)} of {len(done)} done"
         self._result.set_text(f"{state}{count}{clock}" if done else "")
         self._buttons.set_visibility(bool(name) and not self._only_watches)
         parts: list[tuple[Element, Callable[..., None], tuple[Any, ...]]] = [
             (self._steps, self._draw_steps, (steps, asks)),
-            (self._faults, _draw_faults, (told.get("faults", []),)),
-            (self._plain, _draw_metrics, (told.get("plain", {}),)),
-            (self._metrics, _draw_metrics, (told.get("metrics", {}),)),
+            (self._faults, _draw_faults, (score.get("faults", []),)),
+            (self._plain, _draw_metrics, (score.get("plain", {}),)),
+            (self._metrics, _draw_metrics, (score.get("metrics", {}),)),
         ]
         for part, draw, shown in parts:
-            if shown != self._parts.get(part):  # a button must not go under a click
+            if shown != self._parts.get(part):  # a button must not vanish under a click
                 part.clear()
                 with part:
                     draw(*shown)
@@ -169,7 +167,7 @@ class ExercisePanel:
                 self._ask(number, step["what"], len(steps))
 
     def _ask(self, number: int, what: str, count: int) -> None:
-        """Make the buttons by which the learner answers on a point, or on the thrombus."""
+        """Build the buttons by which the learner answers on a point, or on the thrombus."""
         points = [f"{k + 1}" for k in range(count - 1)]
         is_last = number == len(points)
         with ui.row().classes("us-answers"):
@@ -181,25 +179,25 @@ class ExercisePanel:
 
     async def _answer(self, number: int, answer: str, is_last: bool) -> None:
         if is_last:
-            refused = await set_parameter(self._scorer, "thrombus", answer)
+            refusal = await set_parameter(self._scorer, "thrombus", answer)
         else:
             known = self._scorer.parameters.get("answers")
             answers = [each for each in known.raw if each] if known is not None else []
             answers += [NO_ANSWER] * (number + 1 - len(answers))
             answers[number] = answer
-            refused = await set_parameter(self._scorer, "answers", answers)
-        is_taken(refused)
+            refusal = await set_parameter(self._scorer, "answers", answers)
+        is_taken(refusal)
 
     async def _clear(self) -> None:
-        name = (self._told or {}).get("name", "")
-        is_running = (self._told or {}).get("state") == "running"
+        score = self._score or {}
         if not is_taken(find_refusal()):
             return
-        if not is_running or await is_confirmed("Begin anew", f"It ends the attempt at {name}."):
+        sentence = f"It ends the attempt at {score.get('name', '')}."
+        if score.get("state") != "running" or await is_confirmed("Begin anew", sentence):
             self._simulator.ask_scorer("clear")
 
     async def _draw(self) -> bool:
-        """Have the picture drawn anew; whether it was."""
+        """Have the scorer draw the picture anew; return whether it did."""
         if not is_taken(find_refusal()):
             return False
         feed = self._simulator.feeds[PICTURE]
@@ -207,7 +205,7 @@ class ExercisePanel:
         self._simulator.ask_scorer("draw")
         for _ in range(int(ANSWER_S / 0.1)):
             if feed.sequence > before:
-                return bool(self._drawn())
+                return bool(self._get_picture())
             await asyncio.sleep(0.1)
         ui.notify("scorer has drawn nothing: is it still there?", type="warning")
         return False
@@ -223,7 +221,7 @@ class ExercisePanel:
 
         if await self._draw():
             now = datetime.now().strftime("%Y-%m-%d-%H-%M-%S")
-            page = render_page(get_score(self._simulator), self._drawn())
+            page = render_page(get_score(self._simulator), self._get_picture())
             ui.download.content(page, f"us_sim-{now}.html", "text/html")
 
 

@@ -23,23 +23,23 @@ from us_sim.viewer.status import NodeLevel, NodeStatus
 from us_sim.viewer.stream import Simulator
 
 COMMON = ("depth", "gain", "dynamic_range", "focus", "time_gain", "grey_map", "overlay", "contact")
-"""Parameters of ``slice_interpolator`` that stand first."""
-STATUS_S = 0.5  # how often states are brought up to date
+"""Parameters of ``slice_interpolator`` that come first."""
+STATUS_S = 0.5  # between two refreshes of the status
 TISSUE = "tissue_deformer"
 METHOD = ("solver", "compare_with")
 MATERIALS, STIFFNESS, PRESSURE = "materials.", ".young_modulus", ".lumen_pressure"
-RECENT_S = 20.0  # how long it is said that a setting was set back
-PROBLEM_S = 60.0  # how long the last problem of a node that is well again is shown
+RECENT_S = 20.0  # for which the refusal of a setting is shown
+PROBLEM_S = 60.0  # for which the last problem of a node that is well again is shown
 
 
 def build_image(simulator: Simulator) -> None:
-    """Make the panel of the scanner's console."""
+    """Build the panel of the scanner's console."""
     console = "", "slice_interpolator", partial(arrange_parameters, first=COMMON)
     build_parameters(simulator.nodes, console, special={"time_gain": TimeGainControl})
 
 
 def arrange_tissue(parameters: Mapping[str, Parameter]) -> list[ParameterSection]:
-    """Put the method first, the settings of those in use, then stiffness and blood's pressure."""
+    """Arrange the method, the settings of the methods in use, stiffness and blood pressure."""
 
     def labels(ending: str, more: str = "") -> dict[str, str]:
         return {
@@ -55,11 +55,11 @@ def arrange_tissue(parameters: Mapping[str, Parameter]) -> list[ParameterSection
 
 
 def build_tissue(simulator: Simulator) -> None:
-    """Make the panel of the tissue, with the skin and the tracker."""
+    """Build the panel of the tissue, with the skin and the tracker."""
     board = simulator.status
 
     def refresh() -> None:
-        notes = _tissue_notes(board.find_node(TISSUE, time.monotonic()))
+        notes = _list_notes(board.find_node(TISSUE, time.monotonic()))
         for label, text in zip(labels, notes, strict=True):
             label.set_text(text)
             label.set_visibility(bool(text))
@@ -78,8 +78,8 @@ def build_tissue(simulator: Simulator) -> None:
     )
 
 
-def _tissue_notes(status: NodeStatus | None) -> tuple[str, str, str]:
-    """The preparation that goes on, the distance of two methods, and the setting refused."""
+def _list_notes(status: NodeStatus | None) -> tuple[str, str, str]:
+    """Return notes on a method in preparation, the difference of two, and a refused setting."""
     if status is None:
         return "", "", ""
     preparing = status.values.get("preparing", "")
@@ -97,7 +97,7 @@ def _tissue_notes(status: NodeStatus | None) -> tuple[str, str, str]:
 
 
 def build_status(simulator: Simulator) -> None:
-    """Make the table of all nodes; choosing one shows its parameters."""
+    """Build the table of all nodes; a click on one shows its parameters."""
     board = simulator.status
 
     def refresh() -> None:
@@ -109,7 +109,7 @@ def build_status(simulator: Simulator) -> None:
 
 
 def _show_parameters(simulator: Simulator, node: str) -> None:
-    """A dialog with all parameters of a node, until it is closed."""
+    """Open a dialog with all parameters of a node."""
     with ui.dialog() as dialog, ui.card().classes("us-dialog"):
         dialog.props["aria-label"] = f"Parameters of {node}"
         with ui.row().classes("us-dialog-head"):
@@ -131,7 +131,7 @@ class StatusTable(Element, component="status_table.js"):
     """A table of all nodes.
 
     Args:
-        choose: called with the name of a node that a person has chosen.
+        choose: called with the name of a node that a person clicks.
     """
 
     def __init__(self, choose: Callable[[str], None]) -> None:
@@ -146,7 +146,7 @@ class StatusTable(Element, component="status_table.js"):
 
 
 def make_row(status: NodeStatus, now: float) -> dict[str, Any]:
-    """A node's row of the table, as texts."""
+    """Make a node's row of the table, as texts."""
 
     def text(key: str, digits: int = 0) -> str:
         number = status.read_number(key)

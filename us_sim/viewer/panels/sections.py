@@ -1,6 +1,6 @@
-"""The parameters of nodes in sections, as their descriptors say them: new ones come by themselves.
+"""The parameters of nodes in sections, from the descriptors: new parameters need no code here.
 
-The controls of a section are made when it is first opened.
+The controls of a section are built when it is first opened.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from us_sim.viewer.panels.controls import ParameterControl, TimeGainControl, Whi
 from us_sim.viewer.parameters import Parameter, format_name
 from us_sim.viewer.remote_parameters import THERE, NodeParameters, RemoteParameters
 
-REFRESH_S = 0.2  # how often what is shown is brought up to date
+REFRESH_S = 0.2  # between two refreshes
 
 
 @dataclass(frozen=True)
 class ParameterSection:
     """Parameters under one title."""
 
-    title: str  # without one it cannot be folded away
+    title: str  # "" for a section that cannot be closed
     names: tuple[str, ...]
     labels: Mapping[str, str] = field(default_factory=dict)  # in place of the parameters' own
-    is_open: bool = False  # at first
+    is_open: bool = False  # when it is first shown
     is_shown: bool = True
 
 
@@ -39,14 +39,14 @@ def arrange_parameters(
     choosing: Sequence[str] = (),
     ahead: Sequence[ParameterSection] = (),
 ) -> list[ParameterSection]:
-    """Put parameters into sections: some, the others by groups, and last those that are fixed.
+    """Arrange parameters in sections: some first, the others by groups, last the fixed ones.
 
     Args:
         parameters: of a node, by name.
-        first: names that stand first; without any of them, those of no group do.
-        choosing: likewise; each chooses the group that has the name of its value. The groups of its
-            other choices are not shown.
-        ahead: sections that stand before those of the groups.
+        first: names that come first; without any, the parameters of no group come first.
+        choosing: names that come next; each value is the name of a group to show, and the groups of
+            the other choices are hidden.
+        ahead: sections that come before those of the groups.
     """
     live = [name for name in parameters if parameters[name].is_live]
     top = [name for name in (*first, *choosing) if name in live]
@@ -72,7 +72,7 @@ def arrange_parameters(
 
 
 def format_title(group: str) -> str:
-    """Write the title of a group of parameters."""
+    """Write the title of a group of parameters, with a capital."""
     words = format_name(group)
     return words[:1].upper() + words[1:]
 
@@ -81,9 +81,9 @@ class ParameterSections:
     """Shows a node's parameters; `refresh_sections` brings them up to date.
 
     Args:
-        node: whose parameters are shown.
+        node: the node's parameters.
         arrange: puts them into sections.
-        special: what makes the controls of some parameters, by their names.
+        special: classes of the controls of some parameters, by name.
     """
 
     def __init__(
@@ -91,15 +91,15 @@ class ParameterSections:
     ) -> None:
         self.node, self._arrange, self._special = node, arrange, special
         self._seen: tuple[str, Mapping[str, Parameter]] | None = None
-        self._layout: object = None  # of what was built
-        self._is_open: dict[str, bool] = {}  # by titles
-        self._boxes: dict[str, Element] = {}  # likewise
+        self._layout: object = None  # of the built sections
+        self._is_open: dict[str, bool] = {}  # by title
+        self._boxes: dict[str, Element] = {}  # by title
         self._controls: dict[str, ParameterControl] = {}
         self._state = ui.label().classes("us-note").props('role="status"')
         self._body = ui.element("div").classes("us-sections")
 
     def refresh_sections(self) -> None:
-        """Show what is known now."""
+        """Show the present parameters."""
         state, parameters = seen = self.node.state, self.node.parameters
         if self._seen is not None and state == self._seen[0] and parameters is self._seen[1]:
             return
@@ -129,7 +129,7 @@ class ParameterSections:
         self._name_depths()
 
     def _build(self, section: ParameterSection) -> Element:
-        """Make a section, with its controls if it is open."""
+        """Build a section, with its controls if it is open."""
         box: Element
 
         def fill() -> None:
@@ -161,7 +161,7 @@ class ParameterSections:
         return box
 
     def _name_depths(self) -> None:
-        """Have the sliders of the time gain reach to the depth of the image."""
+        """Label the sliders of the time gain with depths up to the image's."""
         gains, depth = self._controls.get("time_gain"), self.node.parameters.get("depth")
         if isinstance(gains, TimeGainControl) and depth is not None:
             gains.set_end(float(depth.value), depth.unit)
@@ -172,11 +172,11 @@ def build_parameters(
     *wanted: tuple[str, str, Arrange],
     special: Mapping[str, type[ParameterControl]] | None = None,
 ) -> WhileShown:
-    """Make the sections of some nodes, followed while a person can see them.
+    """Build the sections of some nodes, followed while a person can see them.
 
     Args:
-        nodes: of which some are wanted.
-        wanted: the title, name and arrangement of each.
+        nodes: the parameters of all nodes.
+        *wanted: title, name and arrangement of each node to show.
         special: as for `ParameterSections`.
     """
     made: list[ParameterSections] = []

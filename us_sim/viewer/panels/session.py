@@ -1,4 +1,4 @@
-"""Panels of the session: scenes and cases to load, recording, and replaying recordings."""
+"""Panels of the session: scenes and cases to load, recording, and replay."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from us_sim.viewer.stream import Simulator
 
 AGAIN = "Ends the scene that runs, and starts it anew, without what was set in it"
 ANOTHER = "Ends the scene that runs, and starts this one, without what was set in that"
-EVERY_S = 0.3  # how often the panels are brought up to date
-BY_HAND = ("", "pose")  # trackers of scenes that differ from others in more than their tracker
+EVERY_S = 0.3  # between two refreshes of the panels
+BY_HAND = ("", "pose")  # trackers of the main scenes; others differ from these in the tracker only
 
 
 class CasesPanel:
@@ -39,7 +39,7 @@ class CasesPanel:
     def _refresh(self) -> None:
         board = self._board
         state = board.state
-        self._state.set_text(_told(state))
+        self._state.set_text(_describe_loading(state))
         self._bar.set_visibility(state.is_busy)
         self._bar.set_value(state.fraction)
         self._problem.set_text(state.problem)
@@ -97,10 +97,10 @@ class CasesPanel:
 
 
 async def ask_to_load(simulator: Simulator, scene: ListedScene) -> bool:
-    """Load a scene, and ask first where something ends with the one that runs.
+    """Load a scene, if the person agrees to what ends with the present one.
 
     Returns:
-        whether it is loaded.
+        whether the scene is being loaded.
     """
     record, score = simulator.session.state.record, get_score(simulator)
     ends = [f"the recording {record}, which is kept as it is"] if record else []
@@ -112,7 +112,7 @@ async def ask_to_load(simulator: Simulator, scene: ListedScene) -> bool:
 
 
 async def is_confirmed(what: str, sentence: str) -> bool:
-    """Ask before something ends; whether that shall be."""
+    """Ask the person for agreement; return the answer."""
     with ui.dialog() as dialog, ui.card():
         dialog.props["aria-label"] = what
         ui.label(sentence)
@@ -122,14 +122,14 @@ async def is_confirmed(what: str, sentence: str) -> bool:
     return bool(await dialog)
 
 
-def _told(state: SessionState) -> str:
+def _describe_loading(state: SessionState) -> str:
     if not state.is_there:
         return NOT_THERE
     done = f", {100 * state.fraction:.0f} %" if state.is_busy else ""
     return f"{state.scene.replace('_', ' ')}: {state.state}{done}"
 
 
-SETTLE_S = 1.5  # from an answer until it is so; meanwhile controls stay as a person has set them
+SETTLE_S = 1.5  # from an answer to its effect; meanwhile controls stay as a person has set them
 RATES = {0.1: "0.1 ×", 0.25: "0.25 ×", 0.5: "0.5 ×", 1.0: "1 ×", 2.0: "2 ×", 4.0: "4 ×"}
 KINDS = {"path": "Probe's path", "recording": "All as recorded"}
 KINDS_TOLD = (
@@ -143,13 +143,13 @@ class SessionPanel:
 
     def __init__(self, simulator: Simulator) -> None:
         self._board = simulator.session
-        self._sought: float | None = None  # s, where a person points at, until the replay is there
+        self._sought: float | None = None  # s, time that a person seeks, until the replay is there
         self._is_pointing = False
-        self._asking = 0  # what has not been answered yet
-        self._answered = 0.0  # s, monotonic: when the last answer came
-        self._is_following = False  # while controls are set to what is so
+        self._asking = 0  # requests without an answer
+        self._answered = 0.0  # s, monotonic, of the last answer
+        self._is_following = False  # the program sets the controls, not a person
         self._shown_record = ""  # the recording whose name the field shows
-        self._proposed = _proposed()
+        self._proposed = _propose_name()
         with WhileShown(self._board.add_page, self._board.remove_page, EVERY_S, self._refresh):
             self._absent = ui.label(NOT_THERE).classes("us-quiet")
             with ui.column().classes("us-session") as self._all:
@@ -224,9 +224,9 @@ class SessionPanel:
         enable_control(self._file, not state.record)
         enable_control(self._record, not state.record and state.replay_as == "path")
         enable_control(self._stop, bool(state.record))
-        told, is_short = describe_recording(state) if state.is_recording else ("", False)
-        begun = "recording to" if state.is_recording else f"{state.record_state}:"
-        self._recorded.set_text(f"{begun} {state.record}{told}" if state.record else "")
+        size, is_short = describe_recording(state) if state.is_recording else ("", False)
+        activity = "recording to" if state.is_recording else f"{state.record_state}:"
+        self._recorded.set_text(f"{activity} {state.record}{size}" if state.record else "")
         self._recorded.classes(**{"add" if is_short else "remove": "us-wrong"})
         self._note.set_text(state.record_note)
         self._note.set_visibility(bool(state.record_note))
@@ -238,7 +238,7 @@ class SessionPanel:
         self._follow(state)
 
     def _follow(self, state: SessionState) -> None:
-        """Show the replay as it is, also if it was changed elsewhere."""
+        """Show the state of the replay, also after changes from elsewhere."""
         plays = bool(state.replay)
         is_running = plays and state.is_playing
         self._play.set_icon("pause" if is_running else "play_arrow")
@@ -256,8 +256,8 @@ class SessionPanel:
         if self._sought is None:
             self._time.set_value(min(state.position, state.duration) if plays else 0.0)
         held = ", paused when it is ready" if state.is_starting and state.replay_paused else ""
-        told = f"{state.position:.1f} of {state.duration:.1f} s, {state.replay_state}{held}"
-        self._where.set_text(told if plays else "nothing is replayed")
+        place = f"{state.position:.1f} of {state.duration:.1f} s, {state.replay_state}{held}"
+        self._where.set_text(place if plays else "nothing is replayed")
         if not is_settled:
             return
         self._is_following = True
@@ -272,11 +272,11 @@ class SessionPanel:
             self._is_following = False
 
     def _propose(self) -> None:
-        self._proposed = _proposed()
+        self._proposed = _propose_name()
         self._file.set_value(self._proposed)
 
     def _file_of(self, typed: str) -> str:
-        """The bag of a name that is listed; anything else is a path."""
+        """Return the file of a listed bag's name; any other text is a path."""
         return self._board.bags.get(typed.strip(), typed.strip())
 
     async def _begin(self) -> None:
@@ -309,11 +309,11 @@ class SessionPanel:
             )
 
     def _change(self, **values: object) -> Awaitable[bool] | None:
-        """Ask for what a person has moved a control to, and for nothing while it follows."""
+        """Ask for a change by a person; ignore one by `_follow`."""
         return None if self._is_following else self._ask(**values)
 
     def _drag(self, event: Any) -> None:
-        """Keep the time that a person points at; the replay's may come before the button is up."""
+        """Show the time that a person points at, not the replay's, until the button is up."""
         self._sought, self._is_pointing = float(event.args), True
 
     async def _seek(self, event: Any) -> None:
@@ -321,18 +321,18 @@ class SessionPanel:
         await self._ask(replay_time=float(event.args) if self._sought is None else self._sought)
 
     async def _ask(self, **values: object) -> bool:
-        """Ask for it; whether that was taken."""
+        """Set parameters of ``session_control``; return whether they were taken."""
         self._asking += 1
         try:
-            refused = await ask_session(self._board, **values)
+            refusal = await ask_session(self._board, **values)
         finally:
             self._asking -= 1
             self._answered = time.monotonic()
-        return is_taken(refused)
+        return is_taken(refusal)
 
 
 def describe_recording(state: SessionState) -> tuple[str, bool]:
-    """How long, how large, and how much longer it may become; and whether that is little.
+    """Describe length, size and room of a recording; return also whether the room is short.
 
     >>> state = SessionState(record_seconds=72.0, record_bytes=3.6e8, record_room_bytes=9e9)
     >>> describe_recording(state)
@@ -343,13 +343,13 @@ def describe_recording(state: SessionState) -> tuple[str, bool]:
         return "", False
     minutes, rest = divmod(int(seconds), 60)
     shown = f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.0f} MB"
-    told = f": {minutes}:{rest:02} min, {shown}"
+    text = f": {minutes}:{rest:02} min, {shown}"
     if not size or seconds < 5.0:  # the rate is not known well enough
-        return f"{told}, room for {room / 1e9:.1f} GB", False
+        return f"{text}, room for {room / 1e9:.1f} GB", False
     left = room / size * seconds / 60.0
     room_for = f"{left / 60:.0f} h" if left > 120 else f"{left:.0f} min"
-    return f"{told}, room for {room_for}", left < 10.0
+    return f"{text}, room for {room_for}", left < 10.0
 
 
-def _proposed() -> str:
+def _propose_name() -> str:
     return f"session_{datetime.now():%Y%m%d_%H%M%S}.mcap"

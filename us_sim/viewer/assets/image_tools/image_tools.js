@@ -71,10 +71,9 @@ const comparing = button(
 const saving = button("Save", "Keep this as a file (key P)", saveChosen);
 const kinds = document.createElement("select");
 kinds.className = "us-kinds";
-kinds.title =
-  "What Save keeps: this image, or the last 10 s; with scale and measurements, or as DICOM the pixels";
+kinds.title = "What Save keeps: this image, or the last 10 s; with scale and measurements";
 kinds.setAttribute("aria-label", "What is saved");
-for (const [kind, [label]] of Object.entries(KINDS)) kinds.append(new Option(label, kind));
+for (const [kind, label] of Object.entries(KINDS)) kinds.append(new Option(label, kind));
 const saved = Object.assign(document.createElement("span"), { className: "us-saved" });
 saved.append(saving, kinds);
 bar.append(saved);

@@ -140,43 +140,27 @@ function drawMeasure(draw, measure, number, to, scale, side) {
   draw.fillText(measure instanceof Note ? measure.words : `${number + 1}`, x + 11, y - 10);
 }
 
-/** What can be saved, by its key: label, the file's ending, whether of all frames, of their pixels. */
-export const KINDS = {
-  png: ["PNG", "png"],
-  dcm: ["DICOM", "dcm", { isRaw: true }],
-  mp4: ["10 s, MP4", "mp4", { isLoop: true }],
-  loop_dcm: ["10 s, DICOM", "dcm", { isLoop: true, isRaw: true }],
-};
+/** Labels of what can be saved, by the ending of the file's name. */
+export const KINDS = { png: "PNG", mp4: "10 s, MP4" };
 
-/**
- * Have the browser keep `frame`, or `frames` of which it is one, as a file of a kind of `KINDS`.
- *
- * Videos and DICOM are made by the viewer, from pictures as the PNG's, or from the frames' pixels.
- */
+/** Have the browser keep `frame` as a PNG, or `frames` as an MP4 that the viewer makes of pictures. */
 export async function save(kind, frame = frameShown(), frames = [frame]) {
-  const [, ending, { isLoop = false, isRaw = false } = {}] = KINDS[kind];
   if (kind === "png") {
     const blob = await blobOf(frame, "image/png", stripsShown());
-    if (blob) keep(blob, frame, ending);
+    if (blob) keep(blob, frame, kind);
     return;
   }
-  const like = ({ header }) =>
-    ["kind", "rows", "columns", "matrix"].map((key) => String(header[key])).join();
-  const chosen = (isLoop ? frames : [frame]).filter((each) => !isRaw || like(each) === like(frame));
   const sent = [];
-  for (const each of chosen) {
-    const [when, ...facts] = factsOf(each);
-    const { header, mode, time, payload } = each;
-    const bytes = isRaw ? payload : await (await blobOf(each, "image/jpeg"))?.arrayBuffer();
-    const told = { ...header, mode, facts: [when, ...facts], time: time / 1000 };
-    if (bytes) sent.push([{ ...told, bytes: bytes.byteLength }, bytes]);
+  for (const each of frames) {
+    const bytes = await (await blobOf(each, "image/jpeg"))?.arrayBuffer();
+    if (bytes) sent.push([{ time: each.time / 1000, bytes: bytes.byteLength }, bytes]);
   }
-  const text = JSON.stringify({ kind, sequence: 0, frames: sent.map(([told]) => told) });
+  const text = JSON.stringify({ kind, sequence: 0, frames: sent.map(([header]) => header) });
   const head = new TextEncoder().encode(text);
   const length = new Uint32Array([head.length]); // little endian where browsers run
   const body = new Blob([length, head, ...sent.map(([, bytes]) => bytes)]);
-  const answer = await fetch(`/us_sim/export/${ending}`, { method: "POST", body });
-  if (answer.ok) keep(await answer.blob(), frame, ending);
+  const answer = await fetch("/us_sim/export", { method: "POST", body });
+  if (answer.ok) keep(await answer.blob(), frame, kind);
   else events.tell("problem", await answer.text());
 }
 
