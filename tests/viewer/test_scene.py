@@ -232,7 +232,7 @@ def test_targets_stand_on_the_skin_in_the_colours_of_their_states_and_move_with_
         for number, (place, state) in enumerate(places, 1)
     ]
     score = scene.patient.feeds["score"]
-    score.offer(lambda n: Packet("score", n, {"scene": "", "steps": steps}, b""))
+    score.offer_packet(lambda n: Packet("score", n, {"scene": "", "steps": steps}, b""))
 
     def stands(y: float, z: float = 0.0) -> list[float]:
         return [-0.02, y, z]

@@ -92,7 +92,9 @@ def test_an_exercise_is_not_ended_unasked(page, session, simulator):
     header = {"name": "compression", "description": "", "scene": "upper_arm", "metrics": {}}
     header |= {"state": "running", "plain": {}, "about": {}, "faults": []}
     simulator.add_feeds(Feed("score"))
-    simulator.feeds["score"].offer(lambda n: Packet("score", n, {**header, "steps": [step]}, b""))
+    simulator.feeds["score"].offer_packet(
+        lambda n: Packet("score", n, {**header, "steps": [step]}, b"")
+    )
     page.goto(page.address)
     page.get_by_role("tab", name="Cases").click()  # the panel of the exercise has opened
     page.get_by_role("button", name="Load liver").click()

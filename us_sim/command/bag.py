@@ -14,6 +14,7 @@ _EXTRACTED = {
 
 
 def bag_options(bag: argparse.ArgumentParser) -> None:
+    """Add the subcommands of `us-sim bag`."""
     bag_commands = bag.add_subparsers(required=True, metavar="COMMAND")
     info = bag_commands.add_parser("info", help="topics, types, counts and times of a recording")
     info.add_argument("file", type=Path)
@@ -99,7 +100,7 @@ def _to_lerobot(args: argparse.Namespace) -> int:
     from us_sim.progress import late_progress
     from us_sim.run.session_lerobot import write_lerobot
 
-    told = write_lerobot(
+    lines = write_lerobot(
         args.files,
         args.out,
         args.task,
@@ -110,5 +111,5 @@ def _to_lerobot(args: argparse.Namespace) -> int:
         action=args.action,
         by_log_time=args.by_log_time,
     )
-    print("\n".join(told))
+    print("\n".join(lines))
     return 0

@@ -1,4 +1,4 @@
-"""The calibrations of `us-sim calibrate`: they read files, write files, and return a sentence."""
+"""Calibrations of `us-sim calibrate`: each reads files, writes a file, and returns a sentence."""
 
 from __future__ import annotations
 
@@ -41,16 +41,16 @@ from us_sim.tracking.camera.rigid_body import read_rigid_body
 
 
 def read_motion(path: Path, name: str | None) -> ProbePath:
-    """The valid poses of a body.
+    """Read the valid poses of a body.
 
     Args:
         path: a bag, or a tracker recording of Plus (.igs.mha, .igs.nrrd).
-        name: a topic; or a transform such as StylusToTracker, or StylusToReference where both
-            are recorded. May be None where there is one.
+        name: a topic, or a transform such as StylusToTracker, or StylusToReference where both are
+            recorded; None for the only one of a recording.
 
     Raises:
-        CalibrationError: the recording has several and none is named.
-        UsSimError: it cannot be read, or has no such poses.
+        CalibrationError: the recording has several, and none is named.
+        UsSimError: the recording cannot be read, or has no such poses.
     """
     if not is_tracker_recording(path):
         return read_path(path, name, option="--pose")
@@ -67,17 +67,21 @@ def read_motion(path: Path, name: str | None) -> ProbePath:
 
 
 def read_signal(path: Path, name: str | None) -> PositionSignal:
-    """The recorded motion as one number over time; arguments as in `read_motion`.
+    """Reduce a recorded motion to one number over time.
+
+    Args:
+        path: as for `read_motion`.
+        name: as for `read_motion`.
 
     Raises:
-        UsSimError: it cannot be read, or shows no motion.
+        UsSimError: the recording cannot be read, or shows no motion.
     """
     motion = read_motion(path, name)
     return compute_position_signal(convert_stamps(motion), motion.positions)
 
 
 def convert_stamps(motion: ProbePath) -> NDArray[np.float64]:
-    """(K,) s, its stamps."""
+    """Convert the stamps of a motion to s, (K,)."""
     return np.asarray(1e-9 * motion.stamps, np.float64)
 
 
@@ -85,11 +89,11 @@ _IMAGES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".
 
 
 def calibrate_photos(settings: CameraCalibrationSettings, progress: Progress | None = None) -> str:
-    """Calibrate a camera and write its info; returns a sentence with the result.
+    """Calibrate a camera and write its camera info; return a sentence with the result.
 
     Args:
-        settings: the photos, what they show, the camera's name, and the file to write.
-        progress: told the fraction of the photos that is done, and how many show the board.
+        settings: the photos, their board, the camera's name, and the file to write.
+        progress: called with the fraction of the photos done, and the number with the board.
 
     Raises:
         CalibrationError: the photos cannot be read or do not determine the camera, or a file to
@@ -144,22 +148,22 @@ def calibrate_photos(settings: CameraCalibrationSettings, progress: Progress | N
         f"{intrinsic} {found.camera.matrix[k, k]:.1f} ± {found.deviations[k]:.1f}"
         for k, intrinsic in enumerate(INTRINSICS[:2])
     )
-    said = (
+    sentence = (
         f"{out}: {focal} pixels, RMS {found.rms:.3f} pixels in {format_count(len(views), 'photo')}"
         f", corners up to {100 * found.reach:.0f} % of the way to the image's"
     )
     if blank:
-        said += f"; {len(blank)} without the board: {', '.join(blank)}"
+        sentence += f"; {len(blank)} without the board: {', '.join(blank)}"
     if far_off:
-        said += f"; {len(far_off)} left out that fit far worse: {', '.join(far_off)}"
-    return f"{said}; {found.note}" if found.note else said
+        sentence += f"; {len(far_off)} left out that fit far worse: {', '.join(far_off)}"
+    return f"{sentence}; {found.note}" if found.note else sentence
 
 
 def find_photos(names: Sequence[str]) -> list[Path]:
-    """The files that are named, or lie in named folders.
+    """List the named photos, and those in named folders.
 
     Raises:
-        CalibrationError: a name stands for no photo.
+        CalibrationError: a name is no photo, and no folder with photos.
     """
     photos: dict[Path, None] = {}
     for text in names:
@@ -173,7 +177,7 @@ def find_photos(names: Sequence[str]) -> list[Path]:
 
 
 def _read(photo: Path) -> NDArray[np.uint8]:
-    """Grey values (rows, columns), turned by nothing: a calibration is of the sensor."""
+    """Read grey values (rows, columns) as on the sensor, not turned as a header asks for."""
     data = np.fromfile(photo, np.uint8)
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(data, flags) if len(data) else None
@@ -186,7 +190,7 @@ _TABLES = {".csv", ".txt"}
 
 
 def calibrate_tip(settings: PivotCalibrationSettings, _: Progress | None = None) -> str:
-    """Find a stylus' tip and write it; returns a sentence with the result.
+    """Find a stylus' tip and write it; return a sentence with the result.
 
     Raises:
         UsSimError: the recording cannot be read or does not determine the tip.
@@ -207,19 +211,19 @@ def calibrate_tip(settings: PivotCalibrationSettings, _: Progress | None = None)
             "swing": found.swing,  # rad, of the direction that turned least
         },
     )
-    said = ", ".join(f"{1e3 * number:z.2f}" for number in found.tip)
+    tip = ", ".join(f"{1e3 * number:z.2f}" for number in found.tip)
     largest = 1e3 * float(found.deviations.max())
     return (
-        f"{out}: tip at {said} mm (± {largest:.2f}), RMS {1e3 * found.rms:.2f} mm over "
+        f"{out}: tip at {tip} mm (± {largest:.2f}), RMS {1e3 * found.rms:.2f} mm over "
         f"{int(found.inliers.sum())} poses, {found.rejected + motion.rejected} left out"
     )
 
 
 def calibrate_registration(settings: LandmarkCalibrationSettings, _: Progress | None = None) -> str:
-    """Register a device to the patient by landmarks; returns a sentence with the result.
+    """Register a device to the patient by landmarks; return a sentence with the result.
 
-    Landmarks on a probe's face, measured in the frame of its marker, likewise give the probe's
-    calibration when inverted.
+    Landmarks on a probe's face, measured in the frame of its marker, give the probe's calibration
+    when inverted.
 
     Raises:
         UsSimError: the files cannot be read or do not determine the registration.
@@ -235,7 +239,7 @@ def calibrate_registration(settings: LandmarkCalibrationSettings, _: Progress | 
                 f"landmarks alike"
             )
     else:
-        measured, frame = _touched(list(known), measured_file, settings.tip, settings.pose)
+        measured, frame = _read_touches(list(known), measured_file, settings.tip, settings.pose)
         names = list(known)
     theirs = np.array([measured[landmark] for landmark in names])
     ours = np.array([known[landmark] for landmark in names])
@@ -259,17 +263,17 @@ def calibrate_registration(settings: LandmarkCalibrationSettings, _: Progress | 
         more={"standard_deviations": {"position": moved, "rotation": turned}},
     )
     worst = int(found.residuals.argmax())
-    told = "" if tre is None else f", leave-one-out TRE {1e3 * tre:.2f} mm"
+    error = "" if tre is None else f", leave-one-out TRE {1e3 * tre:.2f} mm"
     alone = sorted(set(known) ^ set(measured))
     unused = f"; in one file only: {', '.join(alone)}" if alone else ""
     return (
         f"{out}: FRE {1e3 * found.fre:.2f} mm over {len(names)} landmarks (worst "
-        f"{1e3 * found.residuals[worst]:.2f} mm at {names[worst]}){told}{unused}"
+        f"{1e3 * found.residuals[worst]:.2f} mm at {names[worst]}){error}{unused}"
     )
 
 
 def calibrate_clock(settings: ClockCalibrationSettings, _: Progress | None = None) -> str:
-    """Find the offset of a device's stamps; returns a sentence with the result.
+    """Find the offset of a device's stamps and write it; return a sentence with the result.
 
     Raises:
         UsSimError: the recordings cannot be read or do not determine the offset.
@@ -297,10 +301,10 @@ def calibrate_clock(settings: ClockCalibrationSettings, _: Progress | None = Non
     )
 
 
-def _touched(
+def _read_touches(
     names: list[str], recording: Path, tip: Path | None, name: str | None
 ) -> tuple[dict[str, NDArray[np.float64]], str]:
-    """Where a stylus touched the landmarks, m, and in which frame."""
+    """Return the places that a stylus touched, m, by landmark, and their frame."""
     if tip is None:
         raise CalibrationError(
             f"{recording}: is a recording of the stylus, whose tip must be known: give --tip FILE "

@@ -16,7 +16,7 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
 Progress = Callable[[float, str], None]
-"""A callback that is told the fraction done, and what is being done."""
+"""A callback that takes the fraction done, and words on the work."""
 
 _POSE = (
     "topic of a bag, or transform of Plus such as StylusToReference; may be left out where "
@@ -25,7 +25,7 @@ _POSE = (
 
 
 def _out(what: str, name: str) -> Path:
-    """The setting of the file that a calibration writes."""
+    """Make the setting of the file that a calibration writes."""
     file: Path = setting(description=f"file to write{what}", default=Path(name), kw_only=True)
     return file
 
@@ -39,7 +39,7 @@ class CalibrationSettings(Settings):
     out: Path = _out("", "calibration.yaml")
 
     def check(self) -> None:
-        """Refuse to write over a file, which is worth knowing before the work."""
+        """Refuse a file that exists or cannot be written, before the work."""
         if self.out.suffix.lower() not in (".yaml", ".yml"):
             raise self.make_error("out", f"{self.out}: must be a file that ends in .yaml")
         if self.out.exists():
@@ -69,7 +69,7 @@ class PivotCalibrationSettings(CalibrationSettings):
 
 @dataclass(frozen=True)
 class LandmarkCalibrationSettings(CalibrationSettings):
-    """Where the tracker or the probe is, from points touched."""
+    """Pose of the tracker or the probe, from points touched."""
 
     known: Path = setting(description="landmarks in the patient's frame: CSV name,x,y,z")
     measured: Path = setting(

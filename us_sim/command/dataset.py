@@ -9,6 +9,7 @@ from us_sim.errors import EpisodeError
 
 
 def dataset_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `us-sim dataset`; raise EpisodeError if gymnasium is missing."""
     try:
         from us_sim.environment.dataset import DatasetSettings
     except ModuleNotFoundError as error:

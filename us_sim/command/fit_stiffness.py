@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 
 def fit_stiffness_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `us-sim fit-stiffness`."""
     add_scene_options(parser)
     parser.add_argument("session", type=Path, help="recording with the probe's poses and wrenches")
     add_setting_options(parser, StiffnessSettings)
@@ -52,16 +53,16 @@ def _fit(args: argparse.Namespace) -> int:
     volume = load_volume(scene)
     model = build_tissue_model(scene, volume, print)
 
-    def constants(moduli: Mapping[str, float]) -> TissueMaterials:
+    def make_materials(moduli: Mapping[str, float]) -> TissueMaterials:
         given = section.materials
         made = {name: replace(given[name], young_modulus=moduli[name]) for name in given}
         return build_materials(scene, made, model.mesh, volume)
 
     moduli = {name: material.young_modulus for name, material in section.materials.items()}
     show = late_progress("fit-stiffness")
-    found = fit_stiffness(model, constants, moduli, press, settings, show)
-    print(_table(found))
-    _write_scene(settings.out, found, _base(name, scene), scene.name)
+    found = fit_stiffness(model, make_materials, moduli, press, settings, show)
+    print(_format_table(found))
+    _write_scene(settings.out, found, _find_base(name, scene), scene.name)
     _draw(settings.out.with_suffix(".png"), found)
     print(f"{settings.out}: a scene with these moduli; its .png: how they fit")
     return 0
@@ -76,22 +77,22 @@ def _read_press(session: Path, settings: StiffnessSettings) -> RecordedPress:
 
     bag = read_bag(session)
     path = read_path(session, bag.find_topic(settings.pose).name)
-    felt_in, felt = read_wrenches(bag, settings.wrench)
+    wrench_frame, table = read_wrenches(bag, settings.wrench)
     for topic, frame, expected, option in (
         (path.topic, path.frame_id, "patient", "--pose"),
-        (settings.wrench, felt_in, "probe", "--wrench"),
+        (settings.wrench, wrench_frame, "probe", "--wrench"),
     ):
         if frame != expected:
             raise BagError(
                 f"{session}: {topic} is in frame '{frame}': name a topic in frame '{expected}' "
                 f"with {option}"
             )
-    wrenches = felt[[*WRENCH_PARTS]].to_numpy()
-    return pair_press(path.stamps, path.poses, felt["stamp"].to_numpy(), wrenches, settings)
+    wrenches = table[[*WRENCH_PARTS]].to_numpy()
+    return pair_press(path.stamps, path.poses, table["stamp"].to_numpy(), wrenches, settings)
 
 
-def _table(found: StiffnessFit) -> str:
-    """Structures with their moduli and intervals, and the residuals."""
+def _format_table(found: StiffnessFit) -> str:
+    """Format the structures with their moduli and intervals, and the residuals."""
     rows = [("structure", "E (kPa)", "95 % interval (kPa)")]
     for name, modulus in found.moduli.items():
         factor = found.factors.get(name)
@@ -107,25 +108,25 @@ def _table(found: StiffnessFit) -> str:
     return "\n".join([*align_columns(rows), left])
 
 
-def _base(asked: str, scene: Scene) -> dict[str, str]:
-    """The key and value by which a scene in another folder is based on this one."""
+def _find_base(name: str, scene: Scene) -> dict[str, str]:
+    """Return the key and value by which a scene in another folder is based on this one."""
     from us_sim.scene.scene import CASE_PREFIX
 
     if scene.origin.startswith(CASE_PREFIX):
         return {"case": scene.origin.removeprefix(CASE_PREFIX)}
-    is_file = os.path.exists(os.path.expanduser(asked))
-    return {"based_on": str(full_path(scene.origin)) if is_file else asked}
-
-
-def _constants(found: StiffnessFit) -> dict[str, dict[str, float]]:
-    return {name: {"young_modulus": float(f"{found.moduli[name]:.6g}")} for name in found.factors}
+    is_file = os.path.exists(os.path.expanduser(name))
+    return {"based_on": str(full_path(scene.origin)) if is_file else name}
 
 
 def _write_scene(file: Path, found: StiffnessFit, base: Mapping[str, str], name: str) -> None:
-    document = {"name": f"{name}_fitted", **base, "tissue": {"materials": _constants(found)}}
-    told = "".join(f"# {line}".rstrip() + "\n" for line in _table(found).splitlines())
+    materials = {
+        structure: {"young_modulus": float(f"{found.moduli[structure]:.6g}")}
+        for structure in found.factors
+    }
+    document = {"name": f"{name}_fitted", **base, "tissue": {"materials": materials}}
+    remark = "".join(f"# {line}".rstrip() + "\n" for line in _format_table(found).splitlines())
     text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
-    file.write_text(f"# Fitted to a recorded press by `us-sim fit-stiffness`.\n{told}{text}")
+    file.write_text(f"# Fitted to a recorded press by `us-sim fit-stiffness`.\n{remark}{text}")
 
 
 def _draw(file: Path, found: StiffnessFit) -> None:

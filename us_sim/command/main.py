@@ -62,58 +62,61 @@ _COMMANDS = (
         "topics, node parameters and scene settings, with ranges and defaults",
     ),
 )
-"""Each command, the module in which NAME_options adds its options, and its help."""
+"""Name of each command, the module whose NAME_options adds the options, and the help."""
 
 
 class _Interrupted(KeyboardInterrupt):
-    """Ctrl-C, as a class of its own: a plain `KeyboardInterrupt` that has passed through an `exec`
-    of text, as where a dataclass is imported, makes Python end as killed by SIGINT (CPython's
-    pythonrun.c), whatever the exit status."""
+    """Ctrl-C, as a class of its own.
+
+    A plain `KeyboardInterrupt` that has passed through an `exec` of text, as in the import of a
+    dataclass, makes Python end as killed by SIGINT (CPython's pythonrun.c), whatever the status.
+    """
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run one command; 0 when it did its work, 1 with a sentence for bad input, 130 on Ctrl-C."""
-    ended: list[int] = []
+    """Run a command; return 0, 1 after a sentence on bad input, or 130 on Ctrl-C."""
+    signals: list[int] = []
 
     def interrupt(number: int, _: object) -> None:
         """End as on Ctrl-C, so that no node outlives the command."""
-        ended.append(number)
+        signals.append(number)
         raise _Interrupted
 
     before = {number: signal.signal(number, interrupt) for number in _ENDINGS}
-    said, sys.stderr = sys.stderr, cast(TextIO, _Lasting(sys.stderr))
+    stderr, sys.stderr = sys.stderr, cast(TextIO, _LastingStream(sys.stderr))
     try:
         from us_sim.run.domain import take_ros_arguments
 
-        parsed = _parser().parse_args(take_ros_arguments(sys.argv[1:] if args is None else args))
+        words = take_ros_arguments(sys.argv[1:] if args is None else args)
+        parsed = _make_parser().parse_args(words)
         return int(parsed.command(parsed) or 0)
     except UsSimError as error:
-        _say(str(error))
+        _print_error(str(error))
         return 1
     except KeyboardInterrupt:
-        return _interrupted()
+        return _report_interruption()
     except BrokenPipeError:
         sys.stderr.close()
         return 0
     except MemoryError:
-        _say("there is not enough memory")
+        _print_error("there is not enough memory")
         return 1
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        _say(f"{where}{error.strerror or error}")
+        _print_error(f"{where}{error.strerror or error}")
         return 1
     except Exception:
-        if not ended:
+        if not signals:
             raise
-        return _interrupted()  # a library that is broken off while it is imported fails in its way
+        return _report_interruption()  # an interrupted import of a library fails in its own way
     finally:
-        sys.stderr = said
+        sys.stderr = stderr
         for number, handler in before.items():
             signal.signal(number, handler)
 
 
-class _Lasting:
-    """Standard error that may be closed, or lead to a full disk: no work ends for that."""
+class _LastingStream:
+    """Standard error that may be closed, or lead to a full disk, without ending any work."""
 
     def __init__(self, stream: TextIO | None) -> None:
         self._stream = stream or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
@@ -131,8 +134,8 @@ class _Lasting:
         return getattr(self._stream, name)
 
 
-def _parser() -> ChosenParser:
-    """All commands; imported here, where an interruption is one sentence already."""
+def _make_parser() -> ChosenParser:
+    """Make the parser of all commands; an interruption of its imports is one sentence."""
     from us_sim import __version__
     from us_sim.command.options import ChosenParser
 
@@ -151,13 +154,13 @@ def _add_options(name: str, module: str, parser: argparse.ArgumentParser) -> Non
     getattr(commands, f"{name.replace('-', '_')}_options")(parser)
 
 
-def _interrupted() -> int:
-    _say("interrupted")
+def _report_interruption() -> int:
+    _print_error("interrupted")
     return 130
 
 
-def _say(sentence: str) -> None:
-    """On stderr, on a line of its own below bars of work that was broken off."""
+def _print_error(sentence: str) -> None:
+    """Print a sentence to stderr, on a line of its own below the bars of unfinished work."""
     progress = sys.modules.get("us_sim.progress")  # which costs time to import
     if progress is not None:
         progress.end_late_bars()

@@ -15,13 +15,15 @@ from us_sim.settings.spelling import format_count
 
 
 def evaluate_options(parser: argparse.ArgumentParser) -> None:
+    """Add the measurements of `us-sim evaluate`."""
     subjects = parser.add_subparsers(required=True, metavar="MEASUREMENT")
     for name, option in EVALUATIONS.options.items():
         package = importlib.import_module(option.target.partition(":")[0].rpartition(".")[0])
-        subjects.add_parser(name, help=package.__doc__, add_options=partial(_subject_options, name))
+        add_options = partial(_add_subject_options, name)
+        subjects.add_parser(name, help=package.__doc__, add_options=add_options)
 
 
-def _subject_options(name: str, parser: argparse.ArgumentParser) -> None:
+def _add_subject_options(name: str, parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="a part of it, in a few minutes")
     parser.add_argument(
         "--out",
@@ -40,6 +42,7 @@ def _evaluate(name: str, args: argparse.Namespace) -> int:
 
 
 def calibrate_options(parser: argparse.ArgumentParser) -> None:
+    """Add the calibrations of `us-sim calibrate`."""
     calibrations = parser.add_subparsers(required=True, metavar="CALIBRATION")
     for name in CALIBRATIONS:
         settings = CALIBRATIONS.load_settings(name)
@@ -55,6 +58,7 @@ def _calibrate(name: str, args: argparse.Namespace) -> int:
 
 
 def print_marker_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `us-sim print-marker`."""
     parser.add_argument("body", type=Path, help="file of the markers: a rigid body, or a board")
     parser.add_argument("--paper", default="A4", help="of the sheets: A4, A3 or letter")
     parser.add_argument(

@@ -1,7 +1,7 @@
-"""Options of commands: made from settings, and those of every command that takes a scene.
+"""Options of commands: from settings, and those of every command that takes a scene.
 
-A field of settings without a default is a positional argument, or a required option where it is
-keyword-only; a field with one is an option, and a flag where it is a truth.
+A field of settings without a default becomes a positional argument, or a required option if it is
+keyword-only. A field with a default becomes an option, or a flag if it is a bool.
 
 >>> import argparse
 >>> from us_sim.command.calibration_settings import ClockCalibrationSettings
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 class ChosenParser(argparse.ArgumentParser):
-    """A parser to which ``add_options`` adds the options when it is first used."""
+    """A parser to which ``add_options`` adds the options at its first use."""
 
     def __init__(
         self,
@@ -46,7 +46,7 @@ class ChosenParser(argparse.ArgumentParser):
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """As argparse does, with the options added; an option that is none of them is refused."""
+        """Add the options and parse; refuse an unknown option with the closest known one."""
         add_options, self._add_options = self._add_options, None
         if add_options is not None:
             add_options(self)
@@ -67,26 +67,26 @@ S = TypeVar("S", bound=Settings)
 def add_setting_options(
     parser: argparse.ArgumentParser, settings: type[Settings], only: Iterable[str] = ()
 ) -> None:
-    """Add an option for each setting, or only for some."""
+    """Add an option for each setting, or only for the named ones."""
     wanted = set(only) or set(rules_of(settings))
     for field in dataclasses.fields(settings):
         if field.name in wanted:
-            _add(parser, settings, field)
+            _add_option(parser, settings, field)
 
 
 def read_settings(
     args: argparse.Namespace, settings: type[S], only: Iterable[str] = (), **values: Any
 ) -> S:
-    """The settings that the options say.
+    """Read settings from parsed options.
 
     Args:
         args: of a parser that `add_setting_options` has filled.
-        settings: their class.
-        only: as they were added.
-        values: of fields that are no options.
+        settings: class of the settings.
+        only: as for `add_setting_options`.
+        **values: of fields that are no options.
 
     Raises:
-        UsSimError: of the settings' own kind: an option's value will not do.
+        UsSimError: an option's value is wrong; the class is the settings' own.
     """
     for name in set(only) or set(rules_of(settings)):
         if name in args:
@@ -100,7 +100,7 @@ def read_settings(
         raise
 
 
-def _add(
+def _add_option(
     parser: argparse.ArgumentParser, settings: type[Settings], field: dataclasses.Field[Any]
 ) -> None:
     rule, kind = rules_of(settings)[field.name], kinds_of(settings)[field.name]
@@ -112,26 +112,26 @@ def _add(
         kind = next((part for part in get_args(kind) if part is not type(None)), kind)
     unit = rule.quantity.unit if rule.quantity else ""
     names = ", ".join(rule.choice.names if rule.choice else rule.choices)
-    told: dict[str, Any] = {"type": Path} if kind is Path else {}
-    told["help"] = rule.description + (names and f": {names}")
+    more: dict[str, Any] = {"type": Path} if kind is Path else {}
+    more["help"] = rule.description + (names and f": {names}")
     if get_origin(kind) is tuple:
-        told["nargs"] = "+" if Ellipsis in get_args(kind) else len(get_args(kind))
+        more["nargs"] = "+" if Ellipsis in get_args(kind) else len(get_args(kind))
     required = field.default is dataclasses.MISSING
     if required and not field.kw_only:
-        parser.add_argument(field.name, **told)
+        parser.add_argument(field.name, **more)
         return
     if not required:
-        told["default"] = argparse.SUPPRESS
-        told["help"] += f"; default: {field.default} {unit}".rstrip() if field.default else ""
-    named = "FILE" if kind is Path else "N" if rule.quantity else "NAME"
-    parser.add_argument(option, metavar=unit.upper() or named, required=required, **told)
+        more["default"] = argparse.SUPPRESS
+        more["help"] += f"; default: {field.default} {unit}".rstrip() if field.default else ""
+    metavar = unit.upper() or ("FILE" if kind is Path else "N" if rule.quantity else "NAME")
+    parser.add_argument(option, metavar=metavar, required=required, **more)
 
 
 _OF_THE_VIEWER = ("host", "port", "recordings")
 
 
 def add_scene_options(parser: argparse.ArgumentParser, default: str = "") -> None:
-    """A scene, or a case in place of it, and another volume."""
+    """Add the options of a scene, a case in place of it, and another volume."""
     parser.add_argument(
         "scene", nargs="?", help=f"scene file, or name of an installed one{default}"
     )
@@ -144,7 +144,7 @@ def add_scene_options(parser: argparse.ArgumentParser, default: str = "") -> Non
 
 
 def add_parameter_option(parser: argparse.ArgumentParser) -> None:
-    """Parameters of the scene's nodes."""
+    """Add the option of parameters of the scene's nodes."""
     parser.add_argument(
         "--param",
         action="append",
@@ -155,7 +155,7 @@ def add_parameter_option(parser: argparse.ArgumentParser) -> None:
 
 
 def add_path_option(parser: argparse.ArgumentParser, what: str) -> None:
-    """A probe path to play, and the body in it."""
+    """Add the options of a probe path to play, and the body in it."""
     parser.add_argument("--path", type=find_bag, metavar="BAG", help=what)
     parser.add_argument(
         "--topic",
@@ -166,10 +166,10 @@ def add_path_option(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 def read_scene_name(args: argparse.Namespace, default: str | None = None) -> str:
-    """The scene that is asked for, or ``case:`` and the case.
+    """Return the name of the scene, or ``case:`` and the name of the case.
 
     Raises:
-        UsSimError: both are given, or neither and there is no default.
+        UsSimError: both are given, or neither without a default.
     """
     from us_sim.scene.scene import CASE_PREFIX
 
@@ -187,9 +187,9 @@ def read_scene_name(args: argparse.Namespace, default: str | None = None) -> str
 
 
 def add_network_option(parser: argparse.ArgumentParser) -> None:
-    """Whether other machines are talked to, and what ROS itself is told."""
+    """Add the option to talk to other machines, and ROS's own arguments."""
     parser.add_argument("--network", action="store_true", help="talk beyond this host")
-    parser.add_argument(  # taken by `us_sim.command.main`, for there may be more after `--`
+    parser.add_argument(  # `us_sim.command.main` has taken them, up to a `--`
         "--ros-args",
         nargs=argparse.REMAINDER,
         help="for all nodes, as of `ros2 run`: -r __ns:=/left, -r FROM:=TO, -p NAME:=VALUE",
@@ -197,7 +197,7 @@ def add_network_option(parser: argparse.ArgumentParser) -> None:
 
 
 def add_running_options(parser: argparse.ArgumentParser, default: str = "") -> None:
-    """Those of a scene, of the supervision of its nodes, and of the network."""
+    """Add the options of a scene, of the supervision of its nodes, and of the network."""
     from us_sim.run.supervision import SupervisionSettings
 
     add_scene_options(parser, default)
@@ -207,27 +207,27 @@ def add_running_options(parser: argparse.ArgumentParser, default: str = "") -> N
 
 
 def add_viewer_options(parser: argparse.ArgumentParser) -> None:
-    """Where the page is served."""
+    """Add the options of the viewer's server."""
     from us_sim.settings.viewer import ViewerSettings
 
     add_setting_options(parser, ViewerSettings, _OF_THE_VIEWER)
 
 
 def add_view_option(parser: argparse.ArgumentParser) -> None:
-    """Whether the simulation is shown in browsers, too."""
+    """Add the option to show the simulation in a browser, too, and those of the server."""
     parser.add_argument("--view", action="store_true", help="show it in a browser, too")
     add_viewer_options(parser)
 
 
 def read_viewer_settings(args: argparse.Namespace) -> ViewerSettings:
-    """Settings of the viewer; a wrong value raises a UsSimError."""
+    """Read the settings of the viewer; raise UsSimError for a wrong value."""
     from us_sim.settings.viewer import ViewerSettings
 
     return read_settings(args, ViewerSettings, _OF_THE_VIEWER)
 
 
 def read_view_settings(args: argparse.Namespace) -> ViewerSettings | None:
-    """Settings of the viewer; None without ``--view``.
+    """Read the settings of the viewer; None without ``--view``.
 
     Raises:
         UsSimError: a value is wrong, or given without ``--view``.
@@ -240,10 +240,10 @@ def read_view_settings(args: argparse.Namespace) -> ViewerSettings | None:
 
 
 def read_node_parameters(texts: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Values that ``--param`` sets, by name, by node.
+    """Read the values of ``--param``, by node and name.
 
     Raises:
-        UsSimError: a text is not written ``node.name=value``.
+        UsSimError: a text is not ``node.name=value``.
     """
     parameters: dict[str, dict[str, str]] = {}
     for text in texts:
@@ -258,13 +258,13 @@ def read_node_parameters(texts: Sequence[str]) -> dict[str, dict[str, str]]:
 
 
 def read_scene_keys(texts: Sequence[str]) -> dict[str, Any]:
-    """Read keys of a scene that ``--set`` changes, as its YAML has them.
+    """Read the values of ``--set`` as nested keys of a scene.
 
     >>> read_scene_keys(["tissue.solver=fem", "episode.steps=100", "episode.draws={gain: [0, 0]}"])
     {'tissue': {'solver': 'fem'}, 'episode': {'steps': 100, 'draws': {'gain': [0, 0]}}}
 
     Raises:
-        UsSimError: a text is not written ``key.key=value``.
+        UsSimError: a text is not ``key.key=value``.
     """
     import yaml
 

@@ -1,4 +1,4 @@
-"""The command `us-sim param`: list, get and set as `ros2 param`, where ros2cli is not installed.
+"""The command `us-sim param`: list, get and set like `ros2 param`, also without ros2cli.
 
 `us-sim reference NODE` says what parameters mean.
 """
@@ -30,6 +30,7 @@ _TYPES = (  # by rcl_interfaces/msg/ParameterType
 
 
 def param_options(parser: argparse.ArgumentParser) -> None:
+    """Add the subcommands of `us-sim param`."""
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for name, command, arguments, text in (
         ("list", _list, ("node?",), "names of a node's parameters, or of those of all nodes"),
@@ -79,8 +80,8 @@ def _get(asker: _Asker, args: argparse.Namespace) -> int:
         asker.refuse_unknown(node, args.name)
         raise UsSimError(f"{args.name} of {node} is not set")
     kind, _, is_array = _TYPES[values[0].type].partition(" ")
-    said = f"{kind.capitalize()} {'values are' if is_array else 'value is'}:"
-    print(said, parameter_value_to_python(values[0]))
+    label = f"{kind.capitalize()} {'values are' if is_array else 'value is'}:"
+    print(label, parameter_value_to_python(values[0]))
     return 0
 
 
@@ -124,7 +125,7 @@ class _Asker:
         """Look for nodes until the time is over, or the wanted one is there.
 
         Returns:
-            the full names of all but hidden ones, sorted.
+            the full names of all nodes but hidden ones, sorted.
         """
         until = time.monotonic() + seconds
         while True:
@@ -135,7 +136,7 @@ class _Asker:
             self._executor.spin_once(timeout_sec=0.05)
 
     def find_node(self, name: str) -> str:
-        """Return the full name of a node; raise UsSimError when it is not discovered."""
+        """Return the full name of a node; raise UsSimError if it is not discovered."""
         full = name if name.startswith("/") else f"/{name}"
         seen = self.discover_nodes(full, DISCOVERY_S)
         if full in seen:
@@ -148,7 +149,7 @@ class _Asker:
         return sorted(self.ask_node(node, "list_parameters").result.names)
 
     def set_parameter(self, node: str, name: str, value: Any) -> Any:
-        """Set a parameter; a value for which ROS has no type is a text."""
+        """Set a parameter; send a value without a type of ROS as a text."""
         from rclpy.parameter import Parameter
 
         try:
@@ -158,7 +159,7 @@ class _Asker:
         return self.ask_node(node, "set_parameters", [parameter]).results[0]
 
     def ask_node(self, node: str, request: str, *arguments: Any) -> Any:
-        """Return a node's answer; raise UsSimError when none comes."""
+        """Return a node's answer; raise UsSimError if none comes."""
         from rclpy.parameter_client import AsyncParameterClient
 
         client = AsyncParameterClient(self._node, node)
@@ -171,7 +172,7 @@ class _Asker:
         return answer.result()
 
     def refuse_unknown(self, node: str, name: str) -> None:
-        """Raise UsSimError when a node has no parameter of that name."""
+        """Raise UsSimError if the node has no such parameter."""
         known = self.list_parameters(node)
         if name not in known:
             raise UsSimError(f"{node} has no such parameter: {describe_unknown(name, known)}")

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
     from us_sim.tissue.press import Press
 
-_MOSTLY = 0.5  # part of a tetrahedron that a label fills where its greatest strain is looked for
+_MOSTLY = 0.5  # least part of a label in the tetrahedra that count for its greatest strain
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,7 @@ class PressSettings(Settings):
 
 
 def press_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `us-sim press`."""
     add_scene_options(parser)
     parser.add_argument("--solver", help="method in place of the scene's")
     add_setting_options(parser, PressSettings)
@@ -89,7 +90,7 @@ def _press(args: argparse.Namespace) -> int:
     )
     show(1.0, f"{1e3 * curve[-1].depth:.2f} mm deep")
     fractions, names = compute_label_fractions(model.mesh, volume), volume.label_names
-    table = _table(model.mesh, curve, fractions, {0: "tissue"} | dict(names))
+    table = _make_table(model.mesh, curve, fractions, {0: "tissue"} | dict(names))
     with settings.out.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([list(table), *zip(*table.values(), strict=True)])
     _draw(settings.out.with_suffix(".png"), table)
@@ -98,14 +99,15 @@ def _press(args: argparse.Namespace) -> int:
     return 0
 
 
-def _table(
+def _make_table(
     mesh: TetrahedralMesh,
     curve: list[Press],
     fractions: LabelFractions | None,
     names: dict[int, str],
 ) -> dict[str, list[float]]:
-    """Columns by name: force, depth, and strains along the probe's axis in percent by label, the
-    mean by volume and that of the tetrahedron that is pressed together most.
+    """Return columns by name: force, depth, and for each label strains along the probe's axis.
+
+    The strains, in percent, are the mean by volume and that of the most compressed tetrahedron.
     """
     from us_sim.tissue.press import strains_along
 

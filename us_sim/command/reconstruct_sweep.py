@@ -1,4 +1,4 @@
-"""`us-sim reconstruct`: a sweep's file in, a volume or a case out, and how well it predicts."""
+"""Reconstruction for `us-sim reconstruct`: from a file of a sweep to a volume or a case."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from us_sim.volume.sequences.sweep import TrackedSweep, read_sweep
 
 @dataclass(frozen=True)
 class SweepSettings(Settings):
-    """Which sweep, where it goes, and how its images are placed."""
+    """The sweep, the place of the result, and the placement of the images."""
 
     error = VolumeError
 
@@ -42,7 +42,7 @@ class SweepSettings(Settings):
     reference: str = setting(description="name of the frame to reconstruct in", default="Reference")
 
     def check(self) -> None:
-        """Refuse a place that cannot be written to, which is worth knowing before the work."""
+        """Refuse a place that exists or cannot be written, before the work."""
         for path in (self.out, self.picture):
             if path.exists():
                 raise self.make_error("out", f"{path}: exists already; choose another name")
@@ -57,12 +57,12 @@ class SweepSettings(Settings):
 
     @property
     def is_volume(self) -> bool:
-        """Whether a volume's file is written, and not a case."""
+        """True to write a volume's file, and not a case."""
         return self.out.name.lower().endswith(VOLUME_ENDINGS)
 
     @property
     def picture(self) -> Path:
-        """The picture beside the file, or in the case."""
+        """The file of the picture, beside the volume or in the case."""
         if not self.is_volume:
             return self.out / "volume.png"
         ending = max(
@@ -79,17 +79,17 @@ def reconstruct_sweep(
     rest_of: Callable[[TrackedSweep, ImagePart], Rest] | None = None,
     progress: Progress | None = None,
 ) -> str:
-    """Reconstruct a sweep and write the result; returns a sentence about it.
+    """Reconstruct a sweep and write the result; return a sentence about it.
 
     Args:
-        settings: which sweep.
-        compounding: how.
-        part: of each image; where it says nothing, the calibration's.
-        rest_of: makes the function that undoes the tissue's deformation, of the placed sweep.
-        progress: is told how far it is.
+        settings: the sweep, and the place of the result.
+        compounding: method of compounding.
+        part: of each image; the default takes the calibration's.
+        rest_of: makes, from the placed sweep, the function that undoes the tissue's deformation.
+        progress: called with the fraction done, and words on the work.
 
     Raises:
-        UsSimError: the files cannot be read, or nothing can be made of them.
+        UsSimError: the files cannot be read, or do not make a volume.
     """
     calibration = SweepCalibration({}, ImagePart())
     if settings.calibration is not None:

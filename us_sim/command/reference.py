@@ -1,7 +1,7 @@
 """The command `us-sim reference`: topics, node parameters and scene settings, as tables.
 
-`docs/reference.md` is what it prints in a plain installation. Packages that are installed beside
-this one and add solvers or trackers are in what it prints, too.
+`docs/reference.md` is its output in a plain installation. Solvers and trackers of other installed
+packages are in the output, too.
 """
 
 from __future__ import annotations
@@ -78,10 +78,11 @@ _OF_THE_SCENE = {
         "`materials.LABEL.KEY`": "tissue.materials.NAME",
     },
 }
-"""By node: parameters for the keys of a section of the scene, which can be set while running."""
+"""By node: live parameters, and the section of the scene whose keys they have."""
 
 
 def reference_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `us-sim reference`."""
     parser.add_argument(
         "part", nargs="?", help="topics, a node, or a key of a scene such as tissue; default: all"
     )
@@ -90,7 +91,7 @@ def reference_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _reference(args: argparse.Namespace) -> int:
-    text = write_reference_page() if args.part is None else _part(args.part)
+    text = write_reference_page() if args.part is None else _write_part(args.part)
     if args.out is None:
         print(text, end="")
     else:
@@ -100,7 +101,7 @@ def _reference(args: argparse.Namespace) -> int:
 
 def write_reference_page() -> str:
     """Write the whole page."""
-    return f"{INTRODUCTION}\n{_written(make_reference_sections())}"
+    return f"{INTRODUCTION}\n{_write_sections(make_reference_sections())}"
 
 
 def make_reference_sections() -> Iterator[tuple[int, Section]]:
@@ -108,83 +109,78 @@ def make_reference_sections() -> Iterator[tuple[int, Section]]:
     from us_sim.geometry.pose import Placement
     from us_sim.scene.scene import Scene
 
-    yield 2, Section("topics", "Topics", f"{TOPICS_TEXT}\n\n{_topics()}")
+    yield 2, Section("topics", "Topics", f"{TOPICS_TEXT}\n\n{_tabulate_topics()}")
     yield 2, Section("parameters", "Node parameters", PARAMETERS_TEXT)
-    yield from ((3, section) for section in _nodes())
+    yield from ((3, section) for section in _make_node_sections())
     yield 2, Section("scene", "Scene settings", SCENE_TEXT)
     yield from ((3, section) for section in make_sections(Scene, "", {Placement: POSE}))
-    yield (
-        3,
-        Section(
-            "pose", POSE, f"{extract_summary(Placement.__doc__)}\n\n{tabulate_settings(Placement)}"
-        ),
-    )
+    pose = f"{extract_summary(Placement.__doc__)}\n\n{tabulate_settings(Placement)}"
+    yield 3, Section("pose", POSE, pose)
 
 
-def _part(name: str) -> str:
-    """Write those sections that a person asks for by name.
+def _write_part(name: str) -> str:
+    """Write the sections with a name.
 
     Raises:
-        UsSimError: there are none of that name.
+        UsSimError: there is no such section.
     """
     sections = list(make_reference_sections())
     found = [each for each in sections if f"{each[1].path}.".startswith(f"{name}.")]
-    # Or what stands within another, such as a solver or a kind of probe.
+    # Or those within another section, such as a solver or a kind of probe.
     found = found or [each for each in sections if f".{name}." in f"{each[1].path}."]
     if not found:
         known = [section.path for _, section in sections if section.path]
         if find_closest(name, known) is None:
             known = list(dict.fromkeys(path.split(".")[0] for path in known))
         raise UsSimError(f"reference: {describe_unknown(name, known)}")
-    return _written(found)
+    return _write_sections(found)
 
 
-def _written(sections: Iterable[tuple[int, Section]]) -> str:
+def _write_sections(sections: Iterable[tuple[int, Section]]) -> str:
     return "\n".join(f"{'#' * level} {each.title}\n\n{each.text}\n" for level, each in sections)
 
 
-def _topics() -> str:
+def _tabulate_topics() -> str:
     from us_sim.nodes.settings import NODES
     from us_sim.nodes.topics import TOPICS
 
     rows = []
     for topic in TOPICS:
-        sources = _names(topic.publishers)
+        sources = _list_names(topic.publishers)
         if topic.is_from_drivers:
             sources = f"a driver, {sources}" if sources else "a driver"
         elif len(topic.publishers) > len(NODES) / 2:
             silent = [node for node in NODES if node not in topic.publishers]
-            sources = f"every node but {_names(silent)}"
+            sources = f"every node but {_list_names(silent)}"
         kind = f"{topic.type_name}{' (latched)' if topic.latched else ''}"
-        heard = _names(topic.subscribers)
-        rows.append((f"`{topic.name}`", kind, sources, heard, topic.description))
+        subscribers = _list_names(topic.subscribers)
+        rows.append((f"`{topic.name}`", kind, sources, subscribers, topic.description))
     return format_table(("topic", "type", "from", "to", "what it carries"), rows)
 
 
-def _names(names: Iterable[str]) -> str:
+def _list_names(names: Iterable[str]) -> str:
     return ", ".join(f"`{name}`" for name in names)
 
 
-def _nodes() -> Iterator[Section]:
-    """The parameters of each node."""
+def _make_node_sections() -> Iterator[Section]:
+    """Make the sections of the nodes' parameters."""
     from us_sim.nodes.settings import NODES, SceneNodeSettings
     from us_sim.slicing.settings import Imaging
 
     common = "Every node that works on a scene"
-    yield Section("scene_nodes", common, _parameters(SceneNodeSettings))
+    yield Section("scene_nodes", common, _tabulate_parameters(SceneNodeSettings))
     for node, settings in NODES.items():
         text = []
         if SceneNodeSettings in settings:
             text.append(f"Those of [every node that works on a scene](#{make_anchor(common)}).")
         for each in settings:
             if each is Imaging:
-                text.append(
-                    f"The keys of [imaging](#imaging), and {_of_probe()} of the [probe](#probe)."
-                )
+                live = _list_live_of_probes()
+                text.append(f"The keys of [imaging](#imaging), and {live} of the [probe](#probe).")
             elif each is not SceneNodeSettings:
                 about = extract_summary(each.__doc__)
                 is_more = not about.lower().endswith(f"of `{node}`.")  # than whose they are
-                text += [about] * is_more + [_parameters(each)]
+                text += [about] * is_more + [_tabulate_parameters(each)]
         if node in _OF_THE_SCENE:
             keys = _OF_THE_SCENE[node].items()
             links = ", ".join(f"{key} of [{title}](#{make_anchor(title)})" for key, title in keys)
@@ -192,17 +188,17 @@ def _nodes() -> Iterator[Section]:
         yield Section(node, node, "\n\n".join(text))
 
 
-def _of_probe() -> str:
-    """Names of the settings that every kind of probe lets change while images are made."""
+def _list_live_of_probes() -> str:
+    """List the settings that every kind of probe lets change while images are made."""
     from us_sim.nodes.settings import is_live
 
     kinds = [PROBES.load_settings(name) for name in PROBES]
     live = [{name for name in rules_of(kind) if is_live(kind, name)} for kind in kinds]
-    return _names(sorted(set.intersection(*live)))
+    return _list_names(sorted(set.intersection(*live)))
 
 
-def _parameters(settings: type[Settings]) -> str:
-    """Make a table of the parameters that settings are."""
+def _tabulate_parameters(settings: type[Settings]) -> str:
+    """Make a table of settings as parameters of a node."""
     from us_sim.nodes.settings import is_live
 
     kinds = kinds_of(settings)

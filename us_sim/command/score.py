@@ -1,4 +1,4 @@
-"""The command `score`: metrics of a recording as a table, CSV, and a page with a picture."""
+"""The command `us-sim score`: metrics of a recording as a table, CSV, and a page with a picture."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ _FILES = ("score.csv", "score.png", "score.md")
 
 
 def score_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `us-sim score`."""
     parser.add_argument(
         "session",
         type=find_bag,
@@ -47,9 +48,9 @@ def score_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _require_new(out: Path | None, files: Sequence[str]) -> None:
-    taken = [out / file for file in files if (out / file).exists()] if out is not None else []
-    if taken:
-        raise ScoreError(f"{taken[0]} exists already: choose another folder with --out")
+    old = [out / file for file in files if (out / file).exists()] if out is not None else []
+    if old:
+        raise ScoreError(f"{old[0]} exists already: choose another folder with --out")
 
 
 def _score_class(args: argparse.Namespace) -> int:
@@ -82,7 +83,7 @@ def _score(args: argparse.Namespace) -> int:
     table = format_markdown_table(("metric", "value", "unit", "roles"), rows)
     missing = [f"left out: {sentence}" for sentence in scan.missing]
     steps = exercise.evaluate_scan(scan) if exercise is not None else []
-    done = _exercise_table(exercise, steps) if exercise is not None else ""
+    done = _tabulate_steps(exercise, steps) if exercise is not None else ""
     print("\n".join(filter(None, [table, *missing, done])))
     if out is None:
         return 0
@@ -105,8 +106,8 @@ def _score(args: argparse.Namespace) -> int:
     return 0
 
 
-def _exercise_table(exercise: Exercise, steps: Sequence[Step]) -> str:
-    """Steps of the exercise, whether each is done, what was seen of it; then the result."""
+def _tabulate_steps(exercise: Exercise, steps: Sequence[Step]) -> str:
+    """Make a table of an exercise's steps, done or not, with the evidence; then the result."""
     from us_sim.evaluation.report import format_markdown_table
 
     rows = [(each.what, "yes" if each.is_done else "no", each.seen) for each in steps]

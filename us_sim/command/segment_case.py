@@ -1,6 +1,6 @@
 """Segmentation of a case: labels, surfaces and a picture.
 
-All of it is made before the first of it is written, and each file is replaced whole.
+Everything is computed before the first file is written, and each file is replaced whole.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def run_segmentation(asked: SegmentRequest, progress: Progress = lambda *_: None
     """Segment a case; return the result in lines for a person.
 
     Raises:
-        VolumeError: a file cannot be read or used, or nothing is found.
+        VolumeError: a file cannot be read or used, or there are no labels.
         CaseError: the case cannot be read or changed.
     """
     if asked.case.is_file():
@@ -50,9 +50,9 @@ def run_segmentation(asked: SegmentRequest, progress: Progress = lambda *_: None
     case = read_case(asked.case)
     progress(0.0, "reading")
     volume = case.read_volume() if _keeps_labels(asked) else read_volume(case.folder / VOLUME)
-    labels = _labels(asked, volume, progress)
+    labels = _make_labels(asked, volume, progress)
     volume, remarks = labels.apply_to(volume), list(labels.remarks)
-    settings = _with_structures(case.settings, labels, remarks)
+    settings = _add_structures(case.settings, labels, remarks)
     surfaces = {}
     for number, (label, name) in enumerate(sorted(labels.names.items())):
         progress(0.8 + 0.1 * number / len(labels.names), f"surface of {name}")
@@ -81,12 +81,12 @@ def _keeps_labels(asked: SegmentRequest) -> bool:
     return asked.labels is None and asked.seeds is None
 
 
-def _labels(asked: SegmentRequest, volume: Volume, progress: Progress) -> LabelMap:
-    """The labels that are asked for."""
+def _make_labels(asked: SegmentRequest, volume: Volume, progress: Progress) -> LabelMap:
+    """Read the labels, grow them from seeds, or keep the case's own, as asked for."""
     if asked.labels is not None:
         return read_labels(asked.labels, volume, names=asked.given_names(), taken=RESERVED)
     if asked.seeds is not None:
-        seeds = read_seeds(_seeds_file(asked.seeds))
+        seeds = read_seeds(_find_seeds(asked.seeds))
         return segment_volume(volume, seeds, lambda done, part: progress(0.1 + 0.7 * done, part))
     names = {label: name for label, name in volume.label_names.items() if label}
     if volume.labels is None or not names:
@@ -94,8 +94,8 @@ def _labels(asked: SegmentRequest, volume: Volume, progress: Progress) -> LabelM
     return LabelMap(volume.labels, names)
 
 
-def _seeds_file(path: Path) -> Path:
-    """The file of seeds at that path, or the installed one of that name."""
+def _find_seeds(path: Path) -> Path:
+    """Return the file of seeds at the path, or the installed one with that name."""
     if os.path.exists(path):
         return path
     folders = [root / "config" / "seeds" for root in shared_roots()]
@@ -106,11 +106,11 @@ def _seeds_file(path: Path) -> Path:
     return installed[path.stem]
 
 
-def _with_structures(settings: CaseSettings, labels: LabelMap, remarks: list[str]) -> CaseSettings:
-    """The case's settings with these structures; one that was there keeps its material.
+def _add_structures(settings: CaseSettings, labels: LabelMap, remarks: list[str]) -> CaseSettings:
+    """Return the case's settings with the labels' structures; known ones keep their materials.
 
     Raises:
-        CaseError: a name means something else in a case.
+        CaseError: a name has another meaning in a case.
     """
     structures = {}
     for label, name in labels.names.items():

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 
 def demo_options(demo: argparse.ArgumentParser) -> None:
+    """Add the options of `us-sim demo`."""
     add_path_option(
         demo, "play this probe path, such as hand.mcap, a brisk hand; default: the scene's own"
     )
@@ -52,13 +53,13 @@ def _demo(args: argparse.Namespace) -> int:
     begin_fork_server()
     from us_sim.run.live import run_demo
 
-    request = _request(args, "upper_arm", view=read_view_settings(args))
+    request = _make_request(args, "upper_arm", view=read_view_settings(args))
     prepare_ros(network=args.network)
-    return run_demo(request, args.out, _supervision(args))
+    return run_demo(request, args.out, _read_supervision(args))
 
 
-def _request(args: argparse.Namespace, default: str | None = None, **more: Any) -> RunRequest:
-    """Return the scene that is asked for, what is played in it, and more of a request."""
+def _make_request(args: argparse.Namespace, default: str | None = None, **more: Any) -> RunRequest:
+    """Load the scene of the options; return the request to run it, with ``more`` of its fields."""
     parameters = read_node_parameters(args.param)
     from us_sim.run.plan import RunRequest
     from us_sim.scene.reading import load_scene
@@ -67,7 +68,7 @@ def _request(args: argparse.Namespace, default: str | None = None, **more: Any) 
     return RunRequest(scene, parameters, path=args.path, topic=args.topic, **more)
 
 
-def _supervision(args: argparse.Namespace) -> SupervisionSettings:
+def _read_supervision(args: argparse.Namespace) -> SupervisionSettings:
     from us_sim.run.supervision import SupervisionSettings
 
     return read_settings(args, SupervisionSettings)
@@ -82,6 +83,7 @@ class RunSettings(Settings):
 
 
 def run_options(run: argparse.ArgumentParser) -> None:
+    """Add the options of `us-sim run`."""
     add_setting_options(run, RunSettings)
     add_path_option(run, "play this bag's probe path")
     run.add_argument("--dry-run", action="store_true", help="say what would run, and why")
@@ -97,12 +99,12 @@ def _run(args: argparse.Namespace) -> int:
     from us_sim.run.live import dry_run, run_scene
     from us_sim.scene.reading import check_files
 
-    request = _request(
+    request = _make_request(
         args, record=asked.record, duration=asked.duration, view=read_view_settings(args)
     )
     if not args.dry_run:
         prepare_ros(network=args.network)
-        return run_scene(request, _supervision(args))
+        return run_scene(request, _read_supervision(args))
     scene = request.scene
     checked = check_files(scene)
     path = args.path or (Path(scene.path) if scene.path else None)
@@ -118,6 +120,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def render_options(render: argparse.ArgumentParser) -> None:
+    """Add the options of `us-sim render`."""
     add_path_option(render, "bag with the probe path; default: the scene's")
     render.add_argument("--out", type=Path, required=True, help="folder to write to")
     render.add_argument(
@@ -133,10 +136,11 @@ def render_options(render: argparse.ArgumentParser) -> None:
 def _render(args: argparse.Namespace) -> int:
     from us_sim.run.lockstep import render_scene
 
-    return render_scene(_request(args), args.out, truth=args.truth)
+    return render_scene(_make_request(args), args.out, truth=args.truth)
 
 
 def view_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `us-sim view`."""
     add_viewer_options(parser)
     add_setting_options(parser, RunSettings, ("record",))
     add_path_option(
@@ -163,7 +167,7 @@ def view_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _view(args: argparse.Namespace) -> int:
-    supervision = _supervision(args)
+    supervision = _read_supervision(args)
     if not args.attach:
         begin_fork_server()
     from us_sim.run.live import run_scene, view_running
@@ -180,25 +184,25 @@ def _view(args: argparse.Namespace) -> int:
         return view_running(read_viewer_settings(args), parameters, supervision)
     if args.loop and args.path is None:
         raise UsSimError("--loop plays a path again and again: name one with --path")
-    request = _request(
+    request = _make_request(
         args,
         "upper_arm",
         record=read_settings(args, RunSettings, ("record",)).record,
         view=read_viewer_settings(args),
         by_hand=not args.tracker,
         student=args.student,
-        results=_results_address(args),
+        results=_read_results_address(args),
         playing={"stay": True, "loop": args.loop} if args.path is not None else {},
     )
     prepare_ros(network=args.network)
     return run_scene(request, supervision)
 
 
-def _results_address(args: argparse.Namespace) -> str | None:
-    """Return where results go, a folder from wherever nodes run.
+def _read_results_address(args: argparse.Namespace) -> str | None:
+    """Return the address of the results; a folder's is absolute, for nodes run anywhere.
 
     Raises:
-        UsSimError: there is a student and no place, or it cannot be written.
+        UsSimError: a student is given without an address, or the address cannot be written to.
     """
     from us_sim.scoring.result_place import ResultPlace
 
@@ -215,6 +219,7 @@ _OF_THE_PLAYER = ("rate", "loop", "time")
 
 
 def play_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `us-sim play`."""
     from us_sim.nodes.settings import PlayerSettings
 
     parser.add_argument("bag", type=find_bag, help="file or folder, or name of an installed one")

@@ -16,16 +16,16 @@ from us_sim.volume.volume import LabelMap, Volume
 _AXES = ("i", "j", "k")
 _SLICES = 3  # along each axis
 _LINES: tuple[Any, ...] = ("solid", "dashed", "dotted", "dashdot")
-"""In turn, since several structures may have one colour."""
+"""Line styles of structures, in turn, as several structures may have one colour."""
 
 
 def draw_slices(path: Path, volume: Volume, covered: NDArray[np.bool_], title: str) -> None:
-    """Write a PNG of three slices at right angles.
+    """Write a PNG of three slices at right angles, through the middle of the covered part.
 
     Args:
         path: of the new file.
-        volume: its slices through the middle of the covered part are drawn.
-        covered: (i, j, k) where it holds something.
+        volume: the volume to draw.
+        covered: (i, j, k), True for voxels with data.
         title: above the slices.
 
     Raises:
@@ -50,7 +50,7 @@ def draw_segmentation(volume: Volume, found: LabelMap, file: Path) -> None:
     grid, in millimetres from the grid's first voxel, with their surroundings.
     """
     figure = Figure(figsize=(13, 11))
-    # Its places are given: to find them out takes matplotlib as long as all the drawing.
+    # The places are given: matplotlib takes as long to find them as to draw.
     panels = figure.subplots(
         *(3, _SLICES),
         gridspec_kw={"left": 0.05, "right": 0.8, "bottom": 0.05, "top": 0.96, "hspace": 0.3},

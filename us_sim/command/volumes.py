@@ -12,6 +12,7 @@ from us_sim.progress import late_progress
 
 
 def import_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `us-sim import`."""
     from us_sim.volume.deidentification.settings import ImportSettings
 
     parser.add_argument(
@@ -45,7 +46,7 @@ def _import(args: argparse.Namespace) -> int:
             "say where to with --out CASE|FILE, or --picture to see what would be done"
         )
     found = plan_import(args.files, args.out, read_settings(args, ImportSettings))
-    if args.picture is not None:  # before what is refused: it shows what to say
+    if args.picture is not None:  # before a refusal, as it shows the reason
         found.draw(args.picture)
         print(f"{args.picture}: may show a name")
     if args.out is not None:
@@ -55,6 +56,7 @@ def _import(args: argparse.Namespace) -> int:
 
 
 def reconstruct_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `us-sim reconstruct`."""
     from us_sim.command.reconstruct_sweep import SweepSettings
     from us_sim.volume.reconstruction.settings import Compounding, ImagePart
 
@@ -88,6 +90,7 @@ def _reconstruct(args: argparse.Namespace) -> int:
 
 
 def segment_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `us-sim segment`."""
     from us_sim.volume.segmentation.settings import SegmentRequest
 
     add_setting_options(parser, SegmentRequest)
@@ -103,6 +106,7 @@ def _segment(args: argparse.Namespace) -> int:
 
 
 def cases_options(cases: argparse.ArgumentParser) -> None:
+    """Add the options of `us-sim cases`."""
     cases.add_argument(
         "folders",
         nargs="*",

@@ -275,12 +275,12 @@ class ProbeFeeds:
         self._feed.offer_packet(lambda sequence: Packet("probe", sequence, header, b""))
 
 
-def _keep(kept: dict[Any, Any], key: Any, value: Any, most: int) -> None:
+def _keep(values: dict[Any, Any], key: Any, value: Any, most: int) -> None:
     """Keep a value as the newest; drop the oldest beyond ``most``."""
-    kept.pop(key, None)
-    kept[key] = value
-    if len(kept) > most:
-        del kept[next(iter(kept))]
+    values.pop(key, None)
+    values[key] = value
+    if len(values) > most:
+        del values[next(iter(values))]
 
 
 def _make_probe_mesh(message: MarkerArray, sequence: int) -> Packet:
@@ -329,8 +329,8 @@ class RestMeshListener:
         self._watchers: list[Callable[[], None]] = []
         self._subscriptions = Subscriptions(
             node,
-            (PointCloud2, "tissue/rest", self._take_rest, LATCHED, False),
-            (Int32MultiArray, "tissue/tetrahedra", self._take_tetrahedra, LATCHED, False),
+            (PointCloud2, "tissue/rest", self._on_rest, LATCHED, False),
+            (Int32MultiArray, "tissue/tetrahedra", self._on_tetrahedra, LATCHED, False),
         )
         self._rest: PointCloud2 | None = None
         self._tetrahedra: Int32MultiArray | None = None
@@ -347,11 +347,11 @@ class RestMeshListener:
             self._watchers.remove(on_mesh)
         self._subscriptions.set_active(bool(self._watchers))
 
-    def _take_rest(self, message: PointCloud2) -> None:
+    def _on_rest(self, message: PointCloud2) -> None:
         self._rest = message
         self._make(is_complete=False)
 
-    def _take_tetrahedra(self, message: Int32MultiArray) -> None:
+    def _on_tetrahedra(self, message: Int32MultiArray) -> None:
         self._tetrahedra = message
         self._make(is_complete=True)
 
@@ -442,8 +442,8 @@ class StructuresFeed:
         self.feed = Feed("structures", lambda _: post(self._listen), rate=None)
         self._subscriptions = Subscriptions(
             node,
-            (PointCloud2, _NODES, self._take_nodes, STREAM, True),
-            (MarkerArray, _STRUCTURES, self._take_structures, STREAM, True),
+            (PointCloud2, _NODES, self._on_nodes, STREAM, True),
+            (MarkerArray, _STRUCTURES, self._on_structures, STREAM, True),
         )
         self._nodes: dict[int, bytes] = {}  # by stamp, ns
         self._structures: tuple[int, bytes] | None = None
@@ -467,21 +467,21 @@ class StructuresFeed:
             self._nodes.clear()
             self._structures = None
 
-    def _take_nodes(self, data: bytes) -> None:
+    def _on_nodes(self, data: bytes) -> None:
         stamp = make_from_message(
             self._node, PointCloud2, _NODES, data, lambda m: nanoseconds_of(m.header.stamp)
         )
         if stamp is not None:
             _keep(self._nodes, stamp, data, _UNPAIRED)
-            self._try()
+            self._start_making()
 
-    def _take_structures(self, data: bytes) -> None:
+    def _on_structures(self, data: bytes) -> None:
         stamp = read_first_stamp(data)
         if stamp is not None:
             self._structures = stamp, data
-            self._try()
+            self._start_making()
 
-    def _try(self) -> None:
+    def _start_making(self) -> None:
         """Start to make the structures once they and the nodes with their stamp are there."""
         stamp, data = self._structures or (-1, b"")
         nodes, mesh, surface = self._nodes.get(stamp), self._rest.mesh, self._rest.surface

@@ -155,7 +155,7 @@ class HandState(Enum):
 
     @property
     def holds_probe(self) -> bool:
-        """Whether the hand publishes the probe's poses."""
+        """True while the hand publishes the probe's poses."""
         return self in (HandState.RESTING, HandState.MOVING)
 
 

@@ -44,7 +44,7 @@ class ParameterKind(Enum):
 
     @property
     def is_list(self) -> bool:
-        """Whether its value is a tuple."""
+        """True if the value is a tuple."""
         return self in (ParameterKind.WHOLES, ParameterKind.NUMBERS, ParameterKind.TEXTS)
 
 

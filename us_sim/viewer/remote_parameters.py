@@ -168,13 +168,13 @@ class NodeParameters:
             async with asyncio.timeout(ANSWER_S):
                 while not client.services_are_ready():
                     await asyncio.sleep(0.1 * LOOK_S)
-                listed = (await _answer(client.list_parameters())).result.names
+                listed = (await _await_result(client.list_parameters())).result.names
                 names = [name for name in listed if not name.startswith(_OF_ROS)]
-                types = (await _answer(client.get_parameter_types(names))).types
+                types = (await _await_result(client.get_parameter_types(names))).types
                 # For a parameter without a value rclpy answers with no values at all.
                 names = [name for name, type_ in zip(names, types, strict=False) if type_]
-                described = (await _answer(client.describe_parameters(names))).descriptors
-                values = (await _answer(client.get_parameters(names))).values
+                described = (await _await_result(client.describe_parameters(names))).descriptors
+                values = (await _await_result(client.get_parameters(names))).values
         except TimeoutError:
             self.state = SILENT
             self._is_old.set()
@@ -225,20 +225,20 @@ class RemoteParameters:
         return NodeParameters(name, client, self._doors.get(name))
 
 
-async def _answer(asked: Any) -> Any:
+async def _await_result(request: Any) -> Any:
     """Await, in the running event loop, an answer that comes in the node's thread."""
     loop = asyncio.get_running_loop()
     answer: asyncio.Future[Any] = loop.create_future()
 
     def deliver() -> None:
         if not answer.done():  # somebody still waits
-            answer.set_result(asked.result())
+            answer.set_result(request.result())
 
     def on_answer(_: Any) -> None:
         with contextlib.suppress(RuntimeError):  # the loop has ended
             loop.call_soon_threadsafe(deliver)
 
-    asked.add_done_callback(on_answer)
+    request.add_done_callback(on_answer)
     return await answer
 
 

@@ -176,9 +176,9 @@ class ViewerSession(SessionBoard):
         self._name = f"{node.get_namespace().rstrip('/')}/{CONTROL}"
         self._subscriptions = Subscriptions(
             node,
-            (DiagnosticArray, "diagnostics", self._hear, STREAM, False),
-            (DiagnosticArray, "session/scenes", self._take_scenes, LATCHED, False),
-            (DiagnosticArray, "session/bags", self._take_bags, LATCHED, False),
+            (DiagnosticArray, "diagnostics", self._on_diagnostics, STREAM, False),
+            (DiagnosticArray, "session/scenes", self._on_scenes, LATCHED, False),
+            (DiagnosticArray, "session/bags", self._on_bags, LATCHED, False),
         )
         self._timer = node.create_timer(_EVERY_S, self._check)
         self._timer.cancel()
@@ -193,7 +193,7 @@ class ViewerSession(SessionBoard):
         if self._subscriptions.set_active(self.is_watched):
             (self._timer.reset if self.is_watched else self._timer.cancel)()
 
-    def _hear(self, message: DiagnosticArray) -> None:
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name == self._name:
                 self._heard = time.monotonic()
@@ -201,10 +201,10 @@ class ViewerSession(SessionBoard):
                 if before.is_there and before.origin != self.state.origin:
                     self.on_other_scene()
 
-    def _take_scenes(self, message: DiagnosticArray) -> None:
+    def _on_scenes(self, message: DiagnosticArray) -> None:
         self.scenes = tuple(map(_read_scene, message.status))
 
-    def _take_bags(self, message: DiagnosticArray) -> None:
+    def _on_bags(self, message: DiagnosticArray) -> None:
         self.bags = {loggable_text(status.name): status.hardware_id for status in message.status}
 
     def _check(self) -> None:

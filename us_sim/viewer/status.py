@@ -170,13 +170,13 @@ class StatusListener(StatusBoard):
         super().__init__(lambda: post(self._subscribe))
         self._space = f"{node.get_namespace().rstrip('/')}/"
         self._reports = Subscriptions(
-            node, (DiagnosticArray, "diagnostics", self._hear, STREAM, False)
+            node, (DiagnosticArray, "diagnostics", self._on_diagnostics, STREAM, False)
         )
 
     def _subscribe(self) -> None:
         self._reports.set_active(self.is_watched)
 
-    def _hear(self, message: DiagnosticArray) -> None:
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
         now = time.monotonic()
         for status in message.status:
             level = _LEVELS.get(status.level, NodeLevel.ERROR)

@@ -5,12 +5,12 @@
 >>> len(packet.encoded) % 4, Packet.from_bytes(packet.encoded) == packet
 (0, True)
 >>> feed = Feed("image", lambda watched: print("watched" if watched else "left"))
->>> told = []
->>> feed.add_watcher(lambda: told.append(feed.sequence))
+>>> numbers = []
+>>> feed.add_watcher(lambda: numbers.append(feed.sequence))
 watched
 >>> feed.offer_packet(lambda sequence: Packet("image", sequence, {}, b"first"))
 >>> feed.offer_packet(lambda sequence: Packet("image", sequence, {}, b"second"))
->>> told, feed.get_newest().payload
+>>> numbers, feed.get_newest().payload
 ([1, 2], b'second')
 """
 
