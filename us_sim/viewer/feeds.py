@@ -126,24 +126,23 @@ def make_image_feeds(
         arranged: returns whether left and right are exchanged, as in the annotated image, and
             whether the annotated image has the B-mode image at its left.
     """
-    places: list[NDArray[np.float64]] = []  # the newest matrix, once one has come
+    image_to_probe: NDArray[np.float64] | None = None
 
-    def keep_place(message: Float64MultiArray) -> None:
-        places[:] = [affine_from(message)]
+    def keep_matrix(message: Float64MultiArray) -> None:
+        nonlocal image_to_probe
+        image_to_probe = affine_from(message)
 
-    node.subscribe(Float64MultiArray, "ultrasound/image_to_probe", keep_place, LATCHED)
+    node.subscribe(Float64MultiArray, "ultrasound/image_to_probe", keep_matrix, LATCHED)
 
     def add_header(make: Callable[[Image, int, bool], Packet]) -> Make:
         def make_with_header(message: Image, sequence: int) -> Packet:
             flip, is_beside = arranged()
             packet = make(message, sequence, flip)
             header = {**packet.header, **known(int(packet.header["stamp"]))}
-            panels = 2 if is_beside and packet.kind == "annotated" else 1
-            if panels > 1:
-                header["panels"] = panels
-            for matrix in places:
-                columns = int(header["columns"]) // panels
-                matrix = _flip_matrix(matrix, columns) if flip else matrix
+            if image_to_probe is not None:
+                images_abreast = 2 if is_beside and packet.kind == "annotated" else 1
+                columns = int(header["columns"]) // images_abreast
+                matrix = _flip_matrix(image_to_probe, columns) if flip else image_to_probe
                 header["matrix"] = matrix.ravel().tolist()
             return replace(packet, header=header)
 

@@ -170,12 +170,15 @@ class ModeBar:
         deepest = self._read_number("depth")
         if deepest is None:
             return
-        place = {"lateral": 0.0, "depth": 0.5 * deepest, "steering": 0.0, "width": 0.0}
-        place |= {"height": 0.5 * deepest, "size": 0.0}
+        defaults = {"lateral": 0.0, "depth": 0.5 * deepest, "steering": 0.0, "width": 0.0}
+        defaults |= {"height": 0.5 * deepest, "size": 0.0}
         shown = {"colour": self._mode == "velocity", **self._strips}
         for kind, on in shown.items():
             if on and self._read_number(f"{kind}.lateral") is not None:
-                known = {key: self._read_number(f"{kind}.{key}") or place[key] for key in place}
+                known = {
+                    key: self._read_number(f"{kind}.{key}") or default
+                    for key, default in defaults.items()
+                }
                 yield {"kind": kind, "deepest": deepest, **known}
 
     async def _move(self, detail: Any) -> None:
