@@ -170,7 +170,7 @@ def test_too_little_memory_is_named():
         "import resource, sys\n"
         "from us_sim.command import main as command\n"
         "resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))\n"
-        "command._parser = lambda: bytearray(4 << 30)\n"
+        "command._make_parser = lambda: bytearray(4 << 30)\n"
         "sys.exit(command.main([]))"
     )
     ran = subprocess.run(
