@@ -97,8 +97,8 @@ def test_without_standard_error_work_goes_on(stream, monkeypatch, tmp_path, caps
     assert main(["bag", "info", "nowhere.mcap"]) == 1
     file = tmp_path / "a.mcap"
     BagWriter(file).close()
-    assert main(["bag", "repair", str(file)]) == 0
-    assert "0 messages are in" in capsys.readouterr().out
+    assert main(["bag", "info", str(file)]) == 0
+    assert "messages  0" in capsys.readouterr().out
     assert sys.stderr is stream
 
 
