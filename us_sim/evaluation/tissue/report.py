@@ -82,8 +82,8 @@ def _draw_errors(points: pd.DataFrame, panels: str, words: str) -> Figure:
 def _tabulate_errors(points: pd.DataFrame) -> pd.DataFrame:
     """Tabulate the main columns, with names for a reader."""
     table = points[["scene", "method"]].copy()
-    table["ms"], table["max mm"] = points["ms_median"], points["max_error_mm"]
-    table["L2 %"], table["force %"] = 100 * points["rel_l2_error"], 100 * points["force_error"]
+    table["ms"], table["L2 %"] = points["ms_median"], 100 * points["rel_l2_error"]
+    table["force %"] = 100 * points["force_error"]
     table["smallest volume ratio"] = points["smallest_volume_ratio"]
     return table
 
