@@ -57,7 +57,13 @@ class Capsule(_Shape):
 
 @dataclass(frozen=True)
 class RoundedBox(_Shape):
-    """A flat transducer face with rounded edges."""
+    """A flat transducer face with rounded edges.
+
+    Examples:
+        >>> probe = RoundedBox(length=0.05, width=0.03, height=0.05, rounding=0.006)
+        >>> probe.offset_box  # half extents of the core, and the rounding, m
+        array([0.019, 0.009, 0.019, 0.006])
+    """
 
     length: float = setting(_SIZE, "along the probe's x, over everything")
     width: float = setting(_SIZE, "along the probe's y, over everything")

@@ -1,14 +1,4 @@
-"""A frame's pose in one further up a tree of frames, with every link taken at one time.
-
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.geometry.frame_chain import FrameChain
->>> chain = FrameChain("tool", "world")
->>> chain.update_link("base", "world", 0, Pose([0.0, 0.0, 0.0]))
->>> chain.update_link("base", "world", 2_000_000_000, Pose([0.2, 0.0, 0.0]))
->>> stamp, pose = chain.update_link("tool", "base", 1_000_000_000, Pose([0.0, 0.0, 0.3]))
->>> stamp, pose.position
-(1000000000, array([0.1, 0. , 0.3]))
-"""
+"""A frame's pose in one further up a tree of frames, with every link taken at one time."""
 
 from __future__ import annotations
 

@@ -1,11 +1,4 @@
-"""Rigid transforms in metres and unit quaternions (x, y, z, w), and trees of frames.
-
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> pressed = Pose(position=[0.0, 0.0, 0.012], orientation=[0.0, 0.0, 0.0, 1.0])
->>> pressed.transform_points(np.array([[0.0, 0.0, 0.03]]))
-array([[0.   , 0.   , 0.042]])
-"""
+"""Rigid transforms in metres and unit quaternions (x, y, z, w), and trees of frames."""
 
 from __future__ import annotations
 
@@ -35,6 +28,12 @@ class Pose:
     Raises:
         PoseError: a number is not finite, the quaternion's norm is below 1e-6, a component of it
             above 1e6, or the position so far away that products of it would not be finite.
+
+    Examples:
+        >>> import numpy as np
+        >>> pressed = Pose(position=[0.0, 0.0, 0.012], orientation=[0.0, 0.0, 0.0, 1.0])
+        >>> pressed.transform_points(np.array([[0.0, 0.0, 0.03]]))
+        array([[0.   , 0.   , 0.042]])
     """
 
     position: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))

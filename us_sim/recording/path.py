@@ -5,16 +5,6 @@ A body is named ``TOPIC`` where its messages hold one pose, ``TOPIC:NUMBER`` in 
 
 Tracker recordings are sequence files of Plus (`.igs.mha`, `.igs.nrrd`), with or without images:
 every sample has a time and named transforms (``ProbeToTracker``), each with a status.
-
->>> import numpy as np, tempfile
->>> from us_sim.recording.path import ProbePath, read_path, write_path
->>> stamps = 1_700_000_000_000_000_000 + np.array([0, 16_666_667])
->>> positions = np.array([[0, 0, -0.01], [0, 0, -0.009]])
->>> orientations = np.array([[0, 0, 0, 1.0], [0, 0, 0, 1.0]])
->>> file = tempfile.mkdtemp() + "/path.mcap"
->>> write_path(file, ProbePath("/tracker/pose", "patient", stamps, positions, orientations))
->>> read_path(file).positions[:, 2]
-array([-0.01 , -0.009])
 """
 
 from __future__ import annotations
@@ -52,7 +42,15 @@ _RIGID = 5e-3  # how far from 1 a rotation may scale; real trackers round to 3e-
 
 @dataclass(frozen=True, eq=False)
 class ProbePath:
-    """Poses in the order in which they were recorded; their stamps may go back."""
+    """Poses in the order in which they were recorded; their stamps may go back.
+
+    Examples:
+        >>> stamps = 1_700_000_000_000_000_000 + np.array([0, 500_000_000])
+        >>> upright = np.eye(4)[[3, 3]]
+        >>> path = ProbePath("/tracker/pose", "patient", stamps, np.zeros((2, 3)), upright)
+        >>> len(path), path.duration
+        (2, 0.5)
+    """
 
     topic: str
     frame_id: str
@@ -223,6 +221,11 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
         BagError: there is no such bag or topic, several come into question, the topic is of
             another type or encoding, its poses are of several frames, or none is usable.
         TrackingError: the same of a recording.
+
+    Examples:
+        >>> path = read_path("bags/press_and_slide.mcap")
+        >>> len(path), round(float(path.positions[:, 2].max()), 3)  # m, into the tissue
+        (600, 0.012)
     """
     if is_tracker_recording(path):
         return read_tracker_recording(path).make_probe_path(topic, option=option)
@@ -247,6 +250,16 @@ def write_path(file: str | Path, path: ProbePath, *, sidecar: bool = True) -> No
 
     Raises:
         BagError: the file exists or cannot be written.
+
+    Examples:
+        >>> import numpy as np, tempfile
+        >>> stamps = 1_700_000_000_000_000_000 + np.array([0, 16_666_667])
+        >>> positions = np.array([[0, 0, -0.01], [0, 0, -0.009]])
+        >>> orientations = np.array([[0, 0, 0, 1.0], [0, 0, 0, 1.0]])
+        >>> file = tempfile.mkdtemp() + "/path.mcap"
+        >>> write_path(file, ProbePath("/tracker/pose", "patient", stamps, positions, orientations))
+        >>> read_path(file).positions[:, 2]
+        array([-0.01 , -0.009])
     """
     with BagWriter(file, compression="zstd", sidecar=sidecar) as writer:
         write_poses(writer, path)

@@ -1,16 +1,4 @@
-"""Reading bags: MCAP or SQLite, one file or a folder, whole or cut off.
-
->>> import tempfile
->>> from us_sim.recording.reader import read_bag
->>> from us_sim.recording.writer import BagWriter
->>> file = tempfile.mkdtemp() + "/note.mcap"
->>> with BagWriter(file) as writer:
-...     writer.add_topic("/note", "std_msgs/msg/String")
-...     writer.write("/note", bytes.fromhex("00010000 03000000 686900"), 1_700_000_000_000_000_000)
->>> bag = read_bag(file)
->>> [bag.deserialize(message).data for message in bag.read_messages()]
-['hi']
-"""
+"""Reading bags: MCAP or SQLite, one file or a folder, whole or cut off."""
 
 from __future__ import annotations
 
@@ -211,6 +199,18 @@ def read_bag(path: str | Path, *further: Path) -> Bag:
 
     Raises:
         BagError: there is no bag, or it cannot be read; a file that is only cut off can.
+
+    Examples:
+        >>> import tempfile
+        >>> from us_sim.recording.writer import BagWriter
+        >>> file = tempfile.mkdtemp() + "/note.mcap"
+        >>> with BagWriter(file) as writer:
+        ...     writer.add_topic("/note", "std_msgs/msg/String")
+        ...     hi = bytes.fromhex("00010000 03000000 686900")
+        ...     writer.write_message("/note", hi, 1_700_000_000_000_000_000)
+        >>> bag = read_bag(file)
+        >>> [bag.deserialize(message).data for message in bag.read_messages()]
+        ['hi']
     """
     path = Path(path)
     try:

@@ -1,14 +1,4 @@
-"""Recording MCAP as rosbag2 does, so that nothing but the last chunk is lost to a crash.
-
->>> import tempfile
->>> from us_sim.recording.writer import BagWriter
->>> file = tempfile.mkdtemp() + "/session.mcap"
->>> with BagWriter(file, compression="zstd") as writer:
-...     writer.add_topic("/note", "std_msgs/msg/String")
-...     writer.write_message("/note", bytes.fromhex("00010000 03000000 686900"), 1_700_000_000_000_000_000)
->>> open(file, "rb").read(8)
-b'\\x89MCAP0\\r\\n'
-"""
+"""Recording MCAP as rosbag2 does, so that nothing but the last chunk is lost to a crash."""
 
 from __future__ import annotations
 
@@ -119,6 +109,16 @@ class BagWriter:
 
     Raises:
         BagError: something is there already, or the file cannot be made.
+
+    Examples:
+        >>> import tempfile
+        >>> file = tempfile.mkdtemp() + "/session.mcap"
+        >>> with BagWriter(file, compression="zstd") as writer:
+        ...     writer.add_topic("/note", "std_msgs/msg/String")
+        ...     hi = bytes.fromhex("00010000 03000000 686900")
+        ...     writer.write_message("/note", hi, 1_700_000_000_000_000_000)
+        >>> open(file, "rb").read(8)[1:6]
+        b'MCAP0'
     """
 
     def __init__(

@@ -163,6 +163,12 @@ def build_tissue_model(
         SceneError: a label of the volume has no material, or a material, fixed part or structure
             is unknown.
         MeshError, MaterialError: the mesh or a material cannot be used.
+
+    Examples:
+        >>> from us_sim.scene.reading import load_scene
+        >>> scene = load_scene("tests/small_scene.yaml")
+        >>> len(build_tissue_model(scene, load_volume(scene)).mesh.nodes)
+        432
     """
     from us_sim.tissue.model import TissueModel, face_nodes, facing_nodes
 

@@ -304,6 +304,11 @@ def load_scene(name: str | Path, *, volume: str | Path | None = None) -> Scene:
 
     Raises:
         SceneError: the file or a value in it cannot be used; one sentence with file and key.
+
+    Examples:
+        >>> scene = load_scene("upper_arm")
+        >>> scene.tissue.solver, scene.case
+        ('fem_nonlinear', None)
     """
     document, folders, origin = read_scene_document(name)
     if volume and isinstance(document, dict):

@@ -194,7 +194,14 @@ class Part:
 
 @dataclass(frozen=True)
 class Scene(Settings):
-    """A whole scene. Only ``name``, ``volume`` and ``probe`` must be there."""
+    """A whole scene. Only ``name``, ``volume`` and ``probe`` must be there.
+
+    Examples:
+        >>> from us_sim.scene.reading import load_scene
+        >>> scene = load_scene("tests/small_scene.yaml")
+        >>> [part.node for part in scene.list_parts() if part.needed]
+        ['probe_tracker', 'tissue_deformer', 'skin_deformer', 'slice_interpolator']
+    """
 
     error = SceneError
 

@@ -276,7 +276,13 @@ class _Centred(_Holding):
 
 @dataclass(frozen=True)
 class Exercise(Settings):
-    """An exercise: a task in words, and its settings."""
+    """An exercise: a task in words, and its settings.
+
+    Examples:
+        >>> exercise = read_exercise("compression")
+        >>> exercise.task.name, exercise.assigned.structure
+        ('compression', 'vein')
+    """
 
     error: ClassVar = ScoreError
 

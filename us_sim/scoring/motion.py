@@ -30,6 +30,11 @@ class Motion:
 
     Raises:
         ScoreError: fewer than two samples are left, or the arrays do not fit or are not finite.
+
+    Examples:
+        >>> motion = Motion([0.0, 1.0, 2.0], [[0, 0, 0], [3, 0, 0], [3, 4, 0]], [[0, 0, 0, 1]] * 3)
+        >>> motion.steps.tolist(), motion.speeds.tolist()
+        ([1.0, 1.0], [3.0, 4.0])
     """
 
     times: _Array  # (K,) s

@@ -14,16 +14,6 @@ An unstretched spring does not resist a displacement across it, and skin of such
 crease where contact ends. Skin in the body is under tension, which smooths it: the springs are
 prestrained here, and the anchors carry the tension at rest, so that nothing pulls on a surface at
 rest. With ``prestrain=0`` the springs are the paper's.
-
->>> import numpy as np
->>> from us_sim.geometry.collider import Sphere
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.skin.membrane import SkinMembrane
->>> from us_sim.skin.surface import plane_surface
->>> skin = SkinMembrane(plane_surface((0.1, 0.1), 0.005), Sphere(0.03))
->>> pressed = skin.deform(Pose([0, 0, 0.005]))
->>> f"{pressed.vertices[:, 2].max():.3f} m"
-'0.005 m'
 """
 
 from __future__ import annotations
@@ -244,6 +234,16 @@ class SkinMembrane:
         collider: the probe's shape.
         settings: see `MembraneSettings`. Where the mass of a vertex is raised, or a long movement
             of the probe takes more steps, every deformation's ``action`` says so.
+
+    Examples:
+        >>> import numpy as np
+        >>> from us_sim.geometry.collider import Sphere
+        >>> from us_sim.geometry.pose import Pose
+        >>> from us_sim.skin.surface import plane_surface
+        >>> skin = SkinMembrane(plane_surface((0.1, 0.1), 0.005), Sphere(0.03))
+        >>> pressed = skin.deform(Pose([0, 0, 0.005]))
+        >>> f"{pressed.vertices[:, 2].max():.3f} m"
+        '0.005 m'
     """
 
     def __init__(

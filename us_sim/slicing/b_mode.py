@@ -1,15 +1,4 @@
-"""The scanner as a whole: it shows a volume through a probe, with deformed tissue or without.
-
->>> from us_sim.scene.building import build_probe, load_volume
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.scene.reading import parse_scene
->>> from us_sim.slicing.b_mode import BMode
->>> scene = parse_scene({"name": "bare", "volume": {"phantom": "upper_arm", "voxel_size": "1 mm"},
-...                      "probe": {"aperture": "4 cm", "depth": "3 cm", "image": [40, 30]}})
->>> scanner = BMode(load_volume(scene), build_probe(scene))
->>> scanner.render_image(Pose([0, 0, 0.002])).shape
-(30, 40)
-"""
+"""The scanner as a whole: it shows a volume through a probe, with deformed tissue or without."""
 
 from __future__ import annotations
 
@@ -46,6 +35,17 @@ class BMode:
 
     Raises:
         ProbeError: the acoustics do not go with volume and probe, see `BeamAcoustics`.
+
+    Examples:
+        >>> from us_sim.scene.building import build_probe, load_volume
+        >>> from us_sim.geometry.pose import Pose
+        >>> from us_sim.scene.reading import parse_scene
+        >>> volume = {"phantom": "upper_arm", "voxel_size": "1 mm"}
+        >>> probe = {"aperture": "4 cm", "depth": "3 cm", "image": [40, 30]}
+        >>> scene = parse_scene({"name": "bare", "volume": volume, "probe": probe})
+        >>> scanner = BMode(load_volume(scene), build_probe(scene))
+        >>> scanner.render_image(Pose([0, 0, 0.002])).shape
+        (30, 40)
     """
 
     def __init__(

@@ -6,16 +6,6 @@ parabola through the three largest (Céspedes et al., Ultrasonic Imaging 17:142,
 earlier image is warped by the displacement, and the rest is looked for again (Alam and Ophir,
 Ultrasound Med. Biol. 23:95, 1997). Strain is the slope of a weighted least-squares line through the
 displacement (Kallel and Ophir, Ultrasonic Imaging 19:195, 1997).
-
->>> import numpy as np
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.slicing.settings import StrainSettings
->>> from us_sim.slicing.strain_estimate import estimate_strain
->>> probe = LinearProbe(aperture=0.02, depth=0.03, columns=100, rows=300, lines=100, samples=300)
->>> speckle = np.random.default_rng(0).integers(0, 256, (300, 100)).astype(np.uint8)
->>> same = estimate_strain(speckle, speckle, probe, StrainSettings())
->>> float(abs(np.nan_to_num(same.strain)).max()) < 2e-3, round(same.correlation, 3)
-(True, 1.0)
 """
 
 from __future__ import annotations
@@ -251,6 +241,16 @@ def estimate_strain(
 
     Raises:
         ProbeError: a window is longer than half a beam.
+
+    Examples:
+        >>> import numpy as np
+        >>> from us_sim.slicing.probe.probe import LinearProbe
+        >>> from us_sim.slicing.settings import StrainSettings
+        >>> probe = LinearProbe(0.02, 0.03, columns=100, rows=300, lines=100, samples=300)
+        >>> speckle = np.random.default_rng(0).integers(0, 256, (300, 100)).astype(np.uint8)
+        >>> same = estimate_strain(speckle, speckle, probe, StrainSettings())
+        >>> float(abs(np.nan_to_num(same.strain)).max()) < 2e-3, round(same.correlation, 3)
+        (True, 1.0)
     """
     require_short_windows(probe, settings)
     step = probe.depth / probe.samples

@@ -1,16 +1,4 @@
-"""The tissue that solvers deform, and the deformation that they find.
-
->>> from us_sim.tissue.model import TissueModel
->>> model = TissueModel.make_block()
->>> len(model.mesh.nodes), len(model.contact_nodes)
-(216, 36)
->>> f"{model.lumped_mass.sum():.3f} kg"
-'1.000 kg'
->>> fat, muscle = Material(10e3), Material(15e3)
->>> layered = TissueModel.make_block(layers=[(0.02, fat), (0.03, muscle)], gravity=[0.0, 0.0, 9.81])
->>> f"{np.ptp(layered.mesh.nodes[:, 2]):.2f} m, {layered.load.sum(axis=0)[2]:.3g} N"
-'0.05 m, 4.41 N'
-"""
+"""The tissue that solvers deform, and the deformation that they find."""
 
 from __future__ import annotations
 
@@ -138,7 +126,15 @@ class Intervention(Flag):
 
 @dataclass(frozen=True, eq=False)
 class Deformation:
-    """The deformed tissue, and its force on the probe."""
+    """The deformed tissue, and its force on the probe.
+
+    Examples:
+        >>> from us_sim.geometry.pose import Pose
+        >>> from us_sim.tissue.solvers.solver import create_solver
+        >>> pressed = create_solver("fem", TissueModel.make_block()).deform(Pose([0.0, 0.0, 0.01]))
+        >>> pressed.nodes.shape, pressed.is_balanced, bool(pressed.force[2] < 0)
+        ((216, 3), True, True)
+    """
 
     nodes: NDArray[np.float64]  # (N, 3), m, frame patient, in mesh order
     contact_nodes: NDArray[np.int32]  # (K,), nodes that the probe pushes
@@ -184,6 +180,18 @@ class TissueModel:
 
     Raises:
         MeshError: an array has the wrong shape, or names nodes that the mesh has not.
+
+    Examples:
+        >>> model = TissueModel.make_block()
+        >>> len(model.mesh.nodes), len(model.contact_nodes)
+        (216, 36)
+        >>> f"{model.lumped_mass.sum():.3f} kg"
+        '1.000 kg'
+        >>> fat, muscle = Material(10e3), Material(15e3)
+        >>> layers = [(0.02, fat), (0.03, muscle)]
+        >>> layered = TissueModel.make_block(layers=layers, gravity=[0.0, 0.0, 9.81])
+        >>> f"{np.ptp(layered.mesh.nodes[:, 2]):.2f} m, {layered.load.sum(axis=0)[2]:.3g} N"
+        '0.05 m, 4.41 N'
     """
 
     mesh: TetrahedralMesh

@@ -63,6 +63,13 @@ def press_to_force(
 
     Raises:
         SolverError: the tissue finds no balance, or pushes with less than the force at the deepest.
+
+    Examples:
+        >>> from us_sim.tissue.model import TissueModel
+        >>> from us_sim.tissue.solvers.solver import create_solver
+        >>> curve = press_to_force(create_solver("fem", TissueModel.make_block()), 2.0)
+        >>> f"{curve[-1].force:.2f} N at {1e3 * curve[-1].depth:.1f} mm"
+        '2.00 N at 7.6 mm'
     """
     start = start or Pose()
 

@@ -1,13 +1,4 @@
-"""Filters of poses: none, the One-Euro filter, and a constant-velocity Kalman filter on SE(3).
-
->>> from us_sim.tracking.filters import create_filter
->>> from us_sim.tracking.measurement import Measurement
->>> kalman = create_filter("kalman")
->>> for k in range(100):  # 0.1 m/s
-...     filtered = kalman.update(Measurement(k * 10_000_000, Pose([0.001 * k, 0.0, 0.0])))
->>> round(1e6 * (filtered.pose.position[0] - 0.099).item())  # µm behind
-0
-"""
+"""Filters of poses: none, the One-Euro filter, and a constant-velocity Kalman filter on SE(3)."""
 
 from __future__ import annotations
 
@@ -68,6 +59,14 @@ def create_filter(name: str, settings: Settings | None = None) -> PoseFilter:
 
     Raises:
         TrackingError: there is no filter of that name.
+
+    Examples:
+        >>> from us_sim.tracking.measurement import Measurement
+        >>> kalman = create_filter("kalman")
+        >>> for k in range(100):  # 0.1 m/s
+        ...     filtered = kalman.update(Measurement(k * 10_000_000, Pose([0.001 * k, 0.0, 0.0])))
+        >>> round(1e6 * (filtered.pose.position[0] - 0.099).item())  # µm behind
+        0
     """
     made: PoseFilter = FILTERS.load(name)(settings or FILTERS.load_settings(name)())
     return made

@@ -1,10 +1,4 @@
-"""A body's pose as a device measured it, and the state of tracking by the age of the last one.
-
->>> from us_sim.tracking.measurement import Measurement
->>> seen = Measurement(1_000_000_000, Pose([0.0, 0.0, 0.4]), np.diag([1e-8] * 3 + [1e-5] * 3))
->>> round(1e3 * float(seen.position_deviation), 2)  # mm
-0.17
-"""
+"""A body's pose as a device measured it, and the state of tracking by the age of the last one."""
 
 from __future__ import annotations
 
@@ -29,6 +23,12 @@ class Measurement:
 
     Raises:
         TrackingError: the covariance is not a finite symmetric (6, 6) matrix.
+
+    Examples:
+        >>> covariance = np.diag([1e-8] * 3 + [1e-5] * 3)
+        >>> seen = Measurement(1_000_000_000, Pose([0.0, 0.0, 0.4]), covariance)
+        >>> round(1e3 * float(seen.position_deviation), 2)  # mm
+        0.17
     """
 
     stamp: int  # ns, when it was measured: of a camera the middle of the exposure

@@ -46,6 +46,28 @@ class ProbeTracking:
         time_offset: s that are added to the device's stamps.
         coast_for: s without a pose after which the state is *coasting*.
         lost_after: s without a pose after which it is *lost*, and the next one starts anew.
+
+    Examples:
+        >>> import numpy as np
+        >>> from us_sim.geometry.pose import Pose
+        >>> from us_sim.tracking.settings import GateSettings
+        >>> from us_sim.tracking.measurement import Measurement
+        >>> from us_sim.tracking.outlier_gate import OutlierGate
+        >>> from us_sim.tracking.filters import create_filter
+        >>> camera_above = Pose([0.0, 0.0, -0.4])  # and looks along z, into the tissue
+        >>> marker_on_grip = Pose([0.0, 0.0, 0.12])  # the probe's face is 120 mm from it
+        >>> filter, gate = create_filter("none"), OutlierGate(GateSettings())
+        >>> tracking = ProbeTracking(camera_above, marker_on_grip, filter, gate, time_offset=-0.02)
+        >>> seen = Measurement(5_000_000_000, Pose([0.0, 0.0, 0.29]))
+        >>> probe = tracking.process_measurement(seen, 5_010_000_000)
+        >>> probe.stamp, probe.pose.position.round(6).tolist()
+        (4980000000, [0.0, 0.0, 0.01])
+        >>> tracking.find_state(5_010_000_000).value
+        'tracked'
+        >>> leap = Measurement(5_010_000_000, Pose([0.0, 0.0, 0.9]))
+        >>> tracking.process_measurement(leap, 5_020_000_000)
+        >>> tracking.last_problem
+        'the pose is 610.0 mm from the one 10.0 ms before, where 25.0 mm are believed'
     """
 
     def __init__(

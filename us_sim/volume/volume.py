@@ -31,6 +31,12 @@ class Volume:
     Raises:
         VolumeError: an array is not three-dimensional uint8, the two shapes differ, an axis has
             no voxel, or the affine is not finite or not invertible.
+
+    Examples:
+        >>> grey = np.zeros((40, 30, 20), np.uint8)
+        >>> volume = Volume(grey, index_to_patient=np.diag([1e-3, 1e-3, 1e-3, 1.0]))
+        >>> volume.shape, volume.label_names
+        ((40, 30, 20), {})
     """
 
     intensities: NDArray[np.uint8]  # (i, j, k)

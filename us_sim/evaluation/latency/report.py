@@ -61,7 +61,7 @@ def _report(table: pd.DataFrame) -> Report:
     ]
     places = {
         "rows": table.filter(
-            regex="^(case|scheduling|images_a|not_rec|.*_ms_p50|.*_image_ms_p99|cores_all|memory)"
+            regex="^(case|images_a|not_rec|(probe|tissue|ultra).*_ms_p50|.*_image_ms_p99|cores_all|memory)"
         ),
     }
     return Report(take_home, places, targets)

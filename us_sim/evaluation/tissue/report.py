@@ -35,7 +35,7 @@ def report_tissue(references: pd.DataFrame, points: pd.DataFrame) -> Report:
     defaults = points[points["default"]]
     fronts = {scene: _find_pareto_front(some) for scene, some in shown.groupby("scene", sort=False)}
     places = {
-        "references": references,
+        "change": f"{100 * references['l2_change'].max():.2g} %",
         "nodes": f"{_NODES:,}",
         "error": _draw_errors(shown, "scene", "to large deformation on fine elements"),
         "defaults": _tabulate_errors(shown[shown["default"]]),

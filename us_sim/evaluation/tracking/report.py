@@ -113,7 +113,7 @@ def _report(table: pd.DataFrame) -> Report:
             share_y=False,
             labels={"cpu_ms_median": "processor time of an image, ms (median)", "error": ""},
         ),
-        "conditions": _tabulate_conditions(near),
+        "conditions": _tabulate_conditions(near[near["marker"].isin([SINGLE, RIGID_BODY])]),
     }
     return Report(take_home, places, targets)
 

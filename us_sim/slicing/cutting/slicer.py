@@ -35,6 +35,21 @@ class Slicer(ABC):
 
     Raises:
         MeshError: the mesh is not finite, or its tetrahedra name nodes that are not there.
+
+    Examples:
+        >>> from us_sim.geometry.pose import Pose
+        >>> from us_sim.slicing.probe.probe import LinearProbe
+        >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
+        >>> from us_sim.volume.volume import Volume
+        >>> mesh = box_mesh([0.0, 0.04], [0.0, 0.04], [0.0, 0.04])
+        >>> depths = np.tile(np.arange(40, dtype=np.uint8), (40, 40, 1))  # mm
+        >>> volume = Volume(depths, np.diag([1e-3, 1e-3, 1e-3, 1.0]))
+        >>> slicer = create_slicer("scan_conversion", volume, mesh.nodes, mesh.tetrahedra)
+        >>> plane = LinearProbe(aperture=0.02, depth=0.02, columns=20, rows=20).make_plane(
+        ...     Pose([0.02, 0.02, 0.0])
+        ... )
+        >>> slicer.cut_image(mesh.nodes * [1.0, 1.0, 0.5], plane)[:4, 10]  # pressed to a half
+        array([1, 3, 5, 7], dtype=uint8)
     """
 
     skipped: int = 0  # inverted or flat tetrahedra on the latest image, which were left out

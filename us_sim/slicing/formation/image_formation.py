@@ -2,17 +2,6 @@
 
 A volume's grey values are levels: 255 is the strongest echo, each 4.25 less is one decibel less,
 and 0 is no echo, which no gain makes visible.
-
->>> import numpy as np
->>> from us_sim.slicing.formation.image_formation import ImageFormation
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.slicing.settings import Imaging
->>> slice_ = np.full((4, 4), 100, dtype=np.uint8)
->>> probe = LinearProbe(aperture=0.04, depth=0.04, columns=4, rows=4)
->>> ImageFormation(probe, Imaging()).form_picture([slice_]) is slice_
-True
->>> ImageFormation(probe, Imaging(gain=6.0)).form_picture([slice_])[0]
-array([126, 126, 126, 126], dtype=uint8)
 """
 
 from __future__ import annotations
@@ -52,6 +41,17 @@ class ImageFormation:
     Args:
         probe: its geometry.
         imaging: the settings; a stage whose settings are at their defaults is not even imported.
+
+    Examples:
+        >>> import numpy as np
+        >>> from us_sim.slicing.probe.probe import LinearProbe
+        >>> from us_sim.slicing.settings import Imaging
+        >>> slice_ = np.full((4, 4), 100, dtype=np.uint8)
+        >>> probe = LinearProbe(aperture=0.04, depth=0.04, columns=4, rows=4)
+        >>> ImageFormation(probe, Imaging()).form_picture([slice_]) is slice_
+        True
+        >>> ImageFormation(probe, Imaging(gain=6.0)).form_picture([slice_])[0]
+        array([126, 126, 126, 126], dtype=uint8)
     """
 
     def __init__(self, probe: Probe, imaging: Imaging) -> None:

@@ -1,16 +1,4 @@
-"""Transducers: linear, convex and phased arrays, as planes of pixels and as beams.
-
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> probe = LinearProbe(aperture=0.04, depth=0.05, columns=400, rows=500, lines=4)
->>> probe.make_plane(Pose()).origin * 1e3
-array([-19.95,   0.  ,   0.05])
->>> probe.beam_starts * 1e3
-array([[-15.,   0.],
-       [ -5.,   0.],
-       [  5.,   0.],
-       [ 15.,   0.]])
-"""
+"""Transducers: linear, convex and phased arrays, as planes of pixels and as beams."""
 
 from __future__ import annotations
 

@@ -52,6 +52,10 @@ class Material(Settings):
 
     Raises:
         MaterialError: a constant is out of its range.
+
+    Examples:
+        >>> Material(young_modulus=12e3, poisson_ratio=0.49).density
+        1000.0
     """
 
     section = "material"

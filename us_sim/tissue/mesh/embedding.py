@@ -1,16 +1,6 @@
 """Points located in a tetrahedral mesh, and surfaces of structures carried along by the tissue.
 
 Each vertex keeps its barycentric coordinates in the tetrahedron that it lies in at rest.
-
->>> import numpy as np
->>> from us_sim.tissue.mesh.embedding import EmbeddedSurface
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
->>> mesh = box_mesh([0.0, 0.1], [0.0, 0.1], [0.0, 0.1])
->>> square = np.array([[0.2, 0.2, 0.5], [0.8, 0.2, 0.5], [0.8, 0.8, 0.5], [0.2, 0.8, 0.5]]) / 10
->>> surface = EmbeddedSurface(mesh, square, np.array([[0, 1, 2], [0, 2, 3]]))
->>> vertices, normals = surface.deform(mesh.nodes * [1.0, 1.0, 0.5])
->>> vertices[:, 2], normals[0]
-(array([0.025, 0.025, 0.025, 0.025], dtype=float32), array([0., 0., 1.], dtype=float32))
 """
 
 from __future__ import annotations
@@ -231,6 +221,16 @@ class EmbeddedSurface:
     Raises:
         MeshError: the arrays are no surface, or a vertex is farther outside the mesh than half the
             longest edge of the nearest tetrahedron.
+
+    Examples:
+        >>> import numpy as np
+        >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
+        >>> mesh = box_mesh([0.0, 0.1], [0.0, 0.1], [0.0, 0.1])
+        >>> square = np.array([[2, 2, 5], [8, 2, 5], [8, 8, 5], [2, 8, 5]]) / 100
+        >>> surface = EmbeddedSurface(mesh, square, np.array([[0, 1, 2], [0, 2, 3]]))
+        >>> vertices, normals = surface.deform(mesh.nodes * [1.0, 1.0, 0.5])
+        >>> vertices[:, 2], normals[0]
+        (array([0.025, 0.025, 0.025, 0.025], dtype=float32), array([0., 0., 1.], dtype=float32))
     """
 
     def __init__(

@@ -68,6 +68,15 @@ class TissueSolver(ABC):
     A solver never returns a number that is not finite, nor nodes that flew off: when a frame fails
     so, the last good state stays and the deformation's ``actions`` report it. After several such
     frames in a row the tissue is put back to rest.
+
+    Examples:
+        >>> linear = create_solver("fem", TissueModel.make_block())
+        >>> pressed = linear.deform(Pose(position=[0.0, 0.0, 0.01]))
+        >>> nonlinear = create_solver("fem_nonlinear", linear.model)
+        >>> nonlinear.take_over(linear.state)
+        >>> linear.reset()
+        >>> bool(linear.state.displacement.any()), bool(nonlinear.state.displacement.any())
+        (False, True)
     """
 
     name: ClassVar[str]
@@ -278,6 +287,15 @@ def create_solver(
 
     Raises:
         SolverError: no such solver or setting, a setting out of range, or a model it cannot solve.
+
+    Examples:
+        >>> from us_sim.geometry.pose import Pose
+        >>> from us_sim.tissue.model import TissueModel
+        >>> model = TissueModel.make_block()
+        >>> solver = create_solver("fem_cg", model)
+        >>> deformation = solver.deform(Pose(position=[0.0, 0.0, 0.012]))
+        >>> bool(deformation.force[2] < 0)  # the tissue pushes the probe back
+        True
     """
     solver = SOLVERS.load(name)
     if settings is None:

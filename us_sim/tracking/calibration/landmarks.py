@@ -3,12 +3,6 @@
 Horn (1987), Closed-form solution of absolute orientation, by singular values. FRE is the fiducial,
 TRE the target registration error (Fitzpatrick 1998); the latter is measured by leaving each
 landmark out once.
-
->>> from us_sim.tracking.calibration.landmarks import register_landmarks
->>> phantom = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.1]])
->>> found = register_landmarks(phantom, phantom[:, [1, 2, 0]] + 0.5)
->>> found.pose.position
-array([0.5, 0.5, 0.5])
 """
 
 from __future__ import annotations
@@ -64,6 +58,12 @@ def register_landmarks(
     Raises:
         CalibrationError: there are fewer than 3, a coordinate is not finite, they lie on a line,
             or are not the same points (another order, unit or a mirrored frame).
+
+    Examples:
+        >>> phantom = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.1]])
+        >>> found = register_landmarks(phantom, phantom[:, [1, 2, 0]] + 0.5)
+        >>> found.pose.position
+        array([0.5, 0.5, 0.5])
     """
     measured, known = np.asarray(measured, np.float64), np.asarray(known, np.float64)
     names = tuple(names) or tuple(str(k + 1) for k in range(len(known)))

@@ -2,13 +2,6 @@
 
 A pose (R, p) of the body puts the tip t at R t + p, which is the same point c for all of them:
 [R  -I] [t; c] = -p, solved at once ("algebraic one-step", Yaniv 2015, Which pivot calibration?).
-
->>> from us_sim.tracking.calibration.pivot import calibrate_pivot
->>> tip, hole = np.array([0.0, 0.0, 0.15]), np.array([0.1, 0.2, 0.3])
->>> turns = [Pose(orientation=[np.sin(a), np.cos(3 * a) - 1, 0, 4]) for a in range(20)]
->>> poses = [Pose(hole - turn.apply(tip), turn.orientation) for turn in turns]
->>> calibrate_pivot(poses).tip.round(6) + 0.0
-array([0.  , 0.  , 0.15])
 """
 
 from __future__ import annotations
@@ -109,6 +102,13 @@ def calibrate_pivot(poses: Sequence[Pose]) -> PivotCalibration:
     Raises:
         CalibrationError: there are too few poses, they turn about one axis only, or the tip did
             not stay in one place.
+
+    Examples:
+        >>> tip, hole = np.array([0.0, 0.0, 0.15]), np.array([0.1, 0.2, 0.3])
+        >>> turns = [Pose(orientation=[np.sin(a), np.cos(3 * a) - 1, 0, 4]) for a in range(20)]
+        >>> poses = [Pose(hole - turn.transform_points(tip), turn.orientation) for turn in turns]
+        >>> calibrate_pivot(poses).tip.round(6) + 0.0
+        array([0.  , 0.  , 0.15])
     """
     if len(poses) < _FEWEST:
         raise CalibrationError(

@@ -3,15 +3,6 @@
 The offset with the largest normalised cross-correlation, to a part of a sample; its standard
 deviation by leaving out a tenth of the recording at a time (block jackknife, Künsch 1989), which
 holds for errors that are correlated in time too.
-
->>> from us_sim.tracking.calibration.time_offset import PositionSignal, find_time_offset
->>> def swing(t):
-...     return np.sin(2 * t) + np.sin(3.1 * t + 0.2 * t**2)
->>> tracker, video = np.arange(0, 10, 0.02), np.arange(1, 9, 0.085)
->>> late = PositionSignal(tracker + 0.064, swing(tracker))
->>> found = find_time_offset(late, PositionSignal(video, -300 * swing(video)))
->>> round(found.offset, 3), round(found.correlation, 3)
-(-0.064, -1.0)
 """
 
 from __future__ import annotations
@@ -87,6 +78,15 @@ def find_time_offset(
     Raises:
         CalibrationError: they overlap too little, do not move alike, or move so regularly that
             several offsets come into question.
+
+    Examples:
+        >>> def swing(t):
+        ...     return np.sin(2 * t) + np.sin(3.1 * t + 0.2 * t**2)
+        >>> tracker, video = np.arange(0, 10, 0.02), np.arange(1, 9, 0.085)
+        >>> late = PositionSignal(tracker + 0.064, swing(tracker))
+        >>> found = find_time_offset(late, PositionSignal(video, -300 * swing(video)))
+        >>> round(found.offset, 3), round(found.correlation, 3)
+        (-0.064, -1.0)
     """
     if min(len(moving), len(fixed)) < _FEWEST_SAMPLES:
         raise CalibrationError(

@@ -1,15 +1,4 @@
-"""Volume files into frame ``patient``: MetaImage, NRRD, NIfTI and DICOM.
-
->>> import tempfile, SimpleITK
->>> from us_sim.volume.files.readers import read_volume
->>> image = SimpleITK.Image([30, 20, 10], SimpleITK.sitkUInt8)
->>> image.SetSpacing([0.5, 0.5, 1.0]); image.SetOrigin([-7.0, 0.0, 3.0])  # mm
->>> with tempfile.TemporaryDirectory() as folder:
-...     SimpleITK.WriteImage(image, f"{folder}/sweep.nrrd")
-...     volume = read_volume(f"{folder}/sweep.nrrd")
->>> volume.shape, volume.index_to_patient[0].tolist()
-((30, 20, 10), [0.0005, 0.0, 0.0, -0.007])
-"""
+"""Volume files into frame ``patient``: MetaImage, NRRD, NIfTI and DICOM."""
 
 from __future__ import annotations
 
@@ -54,6 +43,16 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
         VolumeError: the file is missing or no image, holds fewer or more bytes than its header
             says, does not fit into memory, is not a scalar three-dimensional image of two voxels
             or more along each axis, or has a spacing, origin or direction that places no volume.
+
+    Examples:
+        >>> import tempfile, SimpleITK
+        >>> image = SimpleITK.Image([30, 20, 10], SimpleITK.sitkUInt8)
+        >>> image.SetSpacing([0.5, 0.5, 1.0]); image.SetOrigin([-7.0, 0.0, 3.0])  # mm
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     SimpleITK.WriteImage(image, f"{folder}/sweep.nrrd")
+        ...     volume = read_volume(f"{folder}/sweep.nrrd")
+        >>> volume.shape, volume.index_to_patient[0].tolist()
+        ((30, 20, 10), [0.0005, 0.0, 0.0, -0.007])
     """
     path = Path(path)
     if placed := _placed_dicom(path):

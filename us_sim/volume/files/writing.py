@@ -38,6 +38,15 @@ def write_volume(path: str | os.PathLike[str], volume: Volume) -> None:
     Raises:
         VolumeError: the name ends otherwise, the grid has no right angles, or the file cannot be
             written.
+
+    Examples:
+        >>> import tempfile
+        >>> from us_sim.volume.files.readers import read_volume
+        >>> file = tempfile.mkdtemp() + "/grey.nrrd"
+        >>> grey = np.full((4, 3, 2), 7, np.uint8)
+        >>> write_volume(file, Volume(grey, np.diag([1e-3, 1e-3, 1e-3, 1.0])))
+        >>> read_volume(file).shape
+        (4, 3, 2)
     """
     path = Path(path)
     if path.name.lower().endswith(".seg.nrrd"):

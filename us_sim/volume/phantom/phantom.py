@@ -151,6 +151,11 @@ def load_or_make_phantom(
 
     Raises:
         VolumeError: there is no such phantom, or the seed or voxel size is out of its range.
+
+    Examples:
+        >>> arm = load_or_make_phantom("upper_arm", seed=1, voxel_size=2e-3)
+        >>> arm.shape, arm.label_names[6]
+        ((36, 30, 27), 'vein')
     """
     make: Callable[[int, float, Progress | None], Volume] = PHANTOMS.load(name)
     key = _key(name, seed, voxel_size)

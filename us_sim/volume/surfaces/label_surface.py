@@ -1,16 +1,4 @@
-"""Surfaces around labelled structures of a volume, by marching cubes, and their STL files.
-
->>> import numpy as np
->>> from us_sim.volume.surfaces.label_surface import make_label_surface
->>> from us_sim.volume.volume import Volume
->>> labels = np.zeros((40, 40, 40), np.uint8)
->>> labels[10:30, 10:30, 10:30] = 6
->>> placed = np.diag([1e-3, 1e-3, 1e-3, 1.0])
->>> volume = Volume(np.zeros_like(labels), placed, labels=labels, label_names={6: "vein"})
->>> vertices, triangles = make_label_surface(volume, 6)
->>> vertices.min(axis=0).round(4), vertices.max(axis=0).round(4)  # m, half a voxel beyond centres
-(array([0.0095, 0.0095, 0.0095]), array([0.0295, 0.0295, 0.0295]))
-"""
+"""Surfaces around labelled structures of a volume, by marching cubes, and their STL files."""
 
 from __future__ import annotations
 
@@ -54,6 +42,17 @@ def make_label_surface(
     Raises:
         VolumeError: the volume has no labels, the label does not occur (in the box), or it is
             thinner than the spacing can show.
+
+    Examples:
+        >>> import numpy as np
+        >>> from us_sim.volume.volume import Volume
+        >>> labels = np.zeros((40, 40, 40), np.uint8)
+        >>> labels[10:30, 10:30, 10:30] = 6
+        >>> placed = np.diag([1e-3, 1e-3, 1e-3, 1.0])
+        >>> volume = Volume(np.zeros_like(labels), placed, labels=labels, label_names={6: "vein"})
+        >>> vertices, triangles = make_label_surface(volume, 6)
+        >>> vertices.min(axis=0).round(4), vertices.max(axis=0).round(4)
+        (array([0.0095, 0.0095, 0.0095]), array([0.0295, 0.0295, 0.0295]))
     """
     from skimage.measure import marching_cubes
 
