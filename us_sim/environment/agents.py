@@ -67,6 +67,10 @@ class VisualServo:
 
     Args:
         press: press the vein once it is in the middle; else only bring it there.
+
+    Examples:
+        >>> VisualServo().act({"image": np.zeros((60, 80, 1), np.uint8)})  # in the air: down
+        array([0.  , 0.  , 0.25, 0.  , 0.  , 0.  ], dtype=float32)
     """
 
     def __init__(self, *, press: bool = True) -> None:

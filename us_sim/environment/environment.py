@@ -1,13 +1,4 @@
-"""A gymnasium environment: a hand or a robot arm that scans a patient of soft tissue.
-
->>> import gymnasium, us_sim.environment
->>> arm = gymnasium.make("us_sim/FindVein-v0", scene="tests/small_scene.yaml")
->>> observation, info = arm.reset(seed=1)
->>> observation["image"].shape, observation["wrench"].shape
-((80, 96, 1), (6,))
->>> observation, reward, terminated, truncated, info = arm.step(arm.action_space.sample())
->>> arm.close()
-"""
+"""A gymnasium environment: a hand or a robot arm that scans a patient of soft tissue."""
 
 from __future__ import annotations
 
@@ -85,6 +76,15 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         EpisodeError: there is no such task or render mode.
         SceneError: the scene cannot be used, or not for this task, or cannot give an observation
             that it asks for.
+
+    Examples:
+        >>> import gymnasium, us_sim.environment
+        >>> arm = gymnasium.make("us_sim/FindVein-v0", scene="tests/small_scene.yaml")
+        >>> observation, info = arm.reset(seed=1)
+        >>> observation["image"].shape, observation["wrench"].shape
+        ((80, 96, 1), (6,))
+        >>> observation, reward, terminated, truncated, info = arm.step(arm.action_space.sample())
+        >>> arm.close()
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - as gymnasium's own

@@ -50,6 +50,15 @@ class FrameChain:
     A pose is made at the latest time at which all links are known, as tf2 does: at the stamps of
     the link that comes last, and so mostly of that which moves least often. Each of the others is
     interpolated there, also where its stamps are ahead.
+
+    Examples:
+        >>> from us_sim.geometry.pose import Pose
+        >>> chain = FrameChain("tool", "world")
+        >>> chain.update_link("base", "world", 0, Pose([0.0, 0.0, 0.0]))
+        >>> chain.update_link("base", "world", 2_000_000_000, Pose([0.2, 0.0, 0.0]))
+        >>> stamp, pose = chain.update_link("tool", "base", 1_000_000_000, Pose([0.0, 0.0, 0.3]))
+        >>> stamp, pose.position
+        (1000000000, array([0.1, 0. , 0.3]))
     """
 
     def __init__(self, frame: str, top: str) -> None:

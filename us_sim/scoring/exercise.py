@@ -1,10 +1,4 @@
-"""Exercises for a learner with the probe, read from YAML, and attempts at them.
-
->>> from us_sim.scoring.exercise import read_exercise
->>> exercise = read_exercise("compression")
->>> exercise.task.name, exercise.assigned.structure
-('compression', 'vein')
-"""
+"""Exercises for a learner with the probe, read from YAML, and attempts at them."""
 
 from __future__ import annotations
 

@@ -4,11 +4,6 @@ Source: Ungi et al., "Perk Tutor: an open-source training platform for ultrasoun
 insertions", IEEE Trans. Biomed. Eng. 59 (2012), and its code, github.com/PerkTutor.
 
 A step is the way from one sample to the next.
-
->>> from us_sim.scoring.motion import Motion
->>> motion = Motion([0.0, 1.0, 2.0], [[0, 0, 0], [3, 0, 0], [3, 4, 0]], [[0, 0, 0, 1]] * 3)
->>> motion.steps.tolist(), motion.speeds.tolist()
-([1.0, 1.0], [3.0, 4.0])
 """
 
 from __future__ import annotations

@@ -3,14 +3,6 @@
 Numba's compiler holds the interpreter's lock for most of its time. With Python's usual turns of
 5 ms a frame in another thread waits a turn each time that it lets the lock go; with turns of 0.1 ms
 it hardly does.
-
->>> from us_sim.tissue.elasticity.material import Material
->>> model = TissueModel.make_block(material=Material(10e3, 0.3, 1000.0))
->>> tissue = LiveTissue(model, TissueMethod("fem_cg", compared="fem"))
->>> for _ in range(20):
-...     deformation = tissue.deform(Pose(position=[0.0, 0.0, 0.01]))
->>> tissue.difference.maximum < 1e-5  # m: the same equations below Poisson's ratio 0.4
-True
 """
 
 from __future__ import annotations

@@ -1,11 +1,4 @@
-"""Presses to a force: the depth at which a probe pushes so hard, and what the tissue does there.
-
->>> from us_sim.tissue.model import TissueModel
->>> from us_sim.tissue.solvers.solver import create_solver
->>> curve = press_to_force(create_solver("fem", TissueModel.make_block()), 2.0)
->>> f"{curve[-1].force:.2f} N at {1e3 * curve[-1].depth:.1f} mm"
-'2.00 N at 7.6 mm'
-"""
+"""Presses to a force: the depth at which a probe pushes so hard, and what the tissue does there."""
 
 from __future__ import annotations
 

@@ -1,24 +1,4 @@
-"""The probe's poses from a device's measurements: registered, checked, filtered.
-
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tracking.settings import GateSettings
->>> from us_sim.tracking.measurement import Measurement
->>> from us_sim.tracking.outlier_gate import OutlierGate
->>> from us_sim.tracking.filters import create_filter
->>> from us_sim.tracking.probe_tracking import ProbeTracking
->>> camera_above = Pose([0.0, 0.0, -0.4])  # and looks along z, into the tissue
->>> marker_on_grip = Pose([0.0, 0.0, 0.12])  # the probe's face is 120 mm from it
->>> filter, gate = create_filter("none"), OutlierGate(GateSettings())
->>> tracking = ProbeTracking(camera_above, marker_on_grip, filter, gate, time_offset=-0.02)
->>> seen = Measurement(5_000_000_000, Pose([0.0, 0.0, 0.29]))
->>> probe = tracking.process_measurement(seen, 5_010_000_000)
->>> probe.stamp, probe.pose.position.round(6).tolist(), tracking.find_state(5_010_000_000).value
-(4980000000, [0.0, 0.0, 0.01], 'tracked')
->>> tracking.process_measurement(Measurement(5_010_000_000, Pose([0.0, 0.0, 0.9])), 5_020_000_000)
->>> tracking.last_problem
-'the pose is 610.0 mm from the one 10.0 ms before, where 25.0 mm are believed'
-"""
+"""The probe's poses from a device's measurements: registered, checked, filtered."""
 
 from __future__ import annotations
 

@@ -285,6 +285,17 @@ class LinearProbe(Probe):
     The image lies in y = 0. The centre of column ``i`` is at
     ``x = (i + 0.5) aperture / columns - aperture / 2`` and that of row ``j`` at
     ``z = (j + 0.5) depth / rows``, so the upper edge of row 0 is the transducer's face.
+
+    Examples:
+        >>> from us_sim.geometry.pose import Pose
+        >>> probe = LinearProbe(aperture=0.04, depth=0.05, columns=400, rows=500, lines=4)
+        >>> probe.make_plane(Pose()).origin * 1e3
+        array([-19.95,   0.  ,   0.05])
+        >>> probe.beam_starts * 1e3
+        array([[-15.,   0.],
+               [ -5.,   0.],
+               [  5.,   0.],
+               [ 15.,   0.]])
     """
 
     aperture: float = setting(Quantity("length", 3e-3, 0.2), "of the face along the array")
@@ -339,6 +350,11 @@ class ConvexProbe(Probe):
 
     The middle of the arc is the origin of frame ``probe``, its centre at z = -radius, and its ends
     lie at z < 0. So the image begins behind the origin, at the ends of the arc.
+
+    Examples:
+        >>> probe = ConvexProbe(radius=0.0508, opening_angle=1.057, depth=0.177)
+        >>> round(probe.width, 3), round(probe.height, 3)  # m, of the image
+        (0.23, 0.184)
     """
 
     radius: float = setting(Quantity("length", 3e-3, 0.3), "of the face's curvature")

@@ -1,14 +1,5 @@
 """The interface of all tissue solvers, and how one is made by its name.
 
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.model import TissueModel
->>> from us_sim.tissue.solvers.solver import create_solver
->>> model = TissueModel.make_block()
->>> solver = create_solver("fem_cg", model)
->>> deformation = solver.deform(Pose(position=[0.0, 0.0, 0.012]))
->>> bool(deformation.force[2] < 0)  # the tissue pushes the probe back
-True
-
 A tissue as small as can be, on which a solver calls the same kernels as on another.
 
 >>> from us_sim.tissue.solvers.solver import make_small_model

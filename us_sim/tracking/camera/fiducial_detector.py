@@ -1,19 +1,4 @@
-"""Finds a body's markers in grey images, to a fraction of a pixel.
-
->>> import cv2, numpy as np
->>> from us_sim.tracking.camera.fiducial_detector import FiducialDetector
->>> from us_sim.tracking.camera.markers import load_dictionary
->>> from us_sim.tracking.camera.rigid_body import RigidBody
->>> image = np.full((200, 200), 255, np.uint8)
->>> marker = cv2.aruco.generateImageMarker(load_dictionary("4X4_50"), 7, 100)
->>> image[50:150, 60:160] = marker
->>> body = RigidBody.create_single("4X4_50", 7, 0.04)
->>> found = FiducialDetector(body).detect_markers(image)
->>> found.ids
-array([7])
->>> np.allclose(found.corners[0, [0, 2]], [[59.5, 49.5], [159.5, 149.5]], atol=0.1)
-True
-"""
+"""Finds a body's markers in grey images, to a fraction of a pixel."""
 
 from __future__ import annotations
 

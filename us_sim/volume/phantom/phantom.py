@@ -1,10 +1,4 @@
-"""Procedural phantoms: labelled ultrasound volumes made from a seed, and cached.
-
->>> from us_sim.volume.phantom.phantom import make_upper_arm
->>> arm = make_upper_arm(seed=1, voxel_size=2e-3)
->>> arm.shape, arm.label_names[6]
-((36, 30, 27), 'vein')
-"""
+"""Procedural phantoms: labelled ultrasound volumes made from a seed, and cached."""
 
 from __future__ import annotations
 
