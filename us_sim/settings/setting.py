@@ -21,7 +21,6 @@ import dataclasses
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from types import UnionType
 from typing import Any, ClassVar, Union, get_args, get_origin
 
@@ -147,18 +146,24 @@ class RefusedValueError(ValueError):
         self.key, self.problem = key, problem
 
 
-@cache
+_rules: dict[type, dict[str, SettingRule]] = {}
+_kinds: dict[type, dict[str, Any]] = {}
+
+
 def rules_of(settings: type) -> dict[str, SettingRule]:
     """Return the rules of a dataclass's settings by name, in order; other fields are left out."""
-    fields = dataclasses.fields(settings)
-    return {f.name: f.metadata["rule"] for f in fields if "rule" in f.metadata}
+    if settings not in _rules:
+        fields = dataclasses.fields(settings)
+        _rules[settings] = {f.name: f.metadata["rule"] for f in fields if "rule" in f.metadata}
+    return _rules[settings]
 
 
-@cache
 def kinds_of(settings: type) -> dict[str, Any]:
     """Return the types of a dataclass's settings by name."""
-    hints = typing.get_type_hints(settings)
-    return {name: hints[name] for name in rules_of(settings)}
+    if settings not in _kinds:
+        hints = typing.get_type_hints(settings)
+        _kinds[settings] = {name: hints[name] for name in rules_of(settings)}
+    return _kinds[settings]
 
 
 def _default(settings: type, name: str) -> Any:

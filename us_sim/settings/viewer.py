@@ -14,7 +14,7 @@ computer cannot read it there, as they could on a command line or among ROS para
 
 @dataclass(frozen=True)
 class ViewerSettings(Settings):
-    """Settings of ``viewer``."""
+    """Of ``viewer``."""
 
     host: str = setting(
         description="address to listen at; any but this computer's own needs the token that is "
