@@ -173,9 +173,9 @@ class SettingsReader:
                     raise self._make_error(
                         join_keys(path, other), f"is for {choice.key} {other} only, not {name}"
                     )
-            own = None
-            if name in mapping:
-                own = self._read_settings(choice, name, mapping[name], path)
+            own = (
+                self._read_settings(choice, name, mapping[name], path) if name in mapping else None
+            )
             return {choice.key, name}, ChosenOption(name, own)
         rest = {k: v for k, v in mapping.items() if k not in beside and k != choice.key}
         return {choice.key, *rest}, ChosenOption(

@@ -1,12 +1,10 @@
 """Names and numbers for a person: suggestions for unknown names, singular and plural, columns.
 
->>> from us_sim.settings.spelling import describe_unknown
+>>> from us_sim.settings.spelling import align_columns, describe_unknown, format_count
 >>> describe_unknown("fem_nonlinaer", ["fem", "fem_nonlinear"])
 "'fem_nonlinaer' is not one of fem, fem_nonlinear; did you mean 'fem_nonlinear'?"
->>> from us_sim.settings.spelling import format_count
 >>> format_count(1, "place"), format_count(0, "place"), format_count(2, "is", "are")
 ('1 place', '0 places', '2 are')
->>> from us_sim.settings.spelling import align_columns
 >>> align_columns([("topic", "count"), ("/tf", "7")])
 ['topic  count', '/tf        7']
 """
