@@ -372,9 +372,9 @@ to_patient[:3, 3] = [-256 * step, -256 * step, 0.0]
 volume = Volume(voxels, to_patient, voxels)
 mesh = box_mesh(*(uniform_planes(-0.05, 0.05, n) for n in (20, 10)), uniform_planes(0, 0.1, 10))
 slicer = create_slicer(sys.argv[1], volume, mesh.nodes, mesh.tetrahedra, threads=2)
-plane = LinearProbe(0.05, 0.05, 512, 512).plane(Pose([0, 1e-3, 0.01]))
+plane = LinearProbe(0.05, 0.05, 512, 512).make_plane(Pose([0, 1e-3, 0.01]))
 nodes = mesh.nodes * [1, 1, 0.9] + [0, 0, 0.01]
-image, labels = slicer.image(nodes, plane), slicer.labels(nodes, plane)
+image, labels = slicer.cut_image(nodes, plane), slicer.cut_labels(nodes, plane)
 assert (image[:, :250] == 100).all() and (image[:, 262:] == 200).all()
 assert (labels[:, :250] == 100).all() and (labels[:, 262:] == 200).all()
 with open("/proc/self/status") as lines:  # getrusage counts the peak of who started this, too
