@@ -112,7 +112,8 @@ class PatientSurface:
         self._node, self._rest = node, rest
         self._skin: StandingSurface | None = None
         self._tissue: StandingSurface | None = None
-        self._plane = StandingSurface.create_plane(0.1)  # m around the origin
+        corners = [[-0.1, -0.1, 0.0], [0.1, -0.1, 0.0], [0.1, 0.1, 0.0], [-0.1, 0.1, 0.0]]  # m
+        self._plane = StandingSurface(np.array(corners), np.array([[0, 2, 1], [0, 3, 2]]))
         self._meshes = Subscriptions(node, (Mesh, "skin/mesh", self._on_skin, LATCHED, False))
 
     def follow_meshes(self, is_wanted: bool) -> None:

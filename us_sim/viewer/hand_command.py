@@ -1,9 +1,11 @@
 """Commands of a page to the hand that holds the probe.
 
+>>> import numpy as np
 >>> from us_sim.tracking.virtual_hand import Stance, StandingSurface
->>> asked = HandCommand.read({"source": "a", "sequence": 7, "to": {"press": 0.004}})
->>> asked = asked.change_stance(Stance(rotation=0.1), StandingSurface.create_plane(0.1))
->>> asked.press, asked.rotation
+>>> command = HandCommand.read({"source": "a", "sequence": 7, "to": {"press": 0.004}})
+>>> surface = StandingSurface(np.eye(3), np.array([[0, 2, 1]]))
+>>> stance = command.change_stance(Stance(rotation=0.1), surface)
+>>> stance.press, stance.rotation
 (0.004, 0.1)
 """
 
