@@ -46,8 +46,8 @@ def test_all_of_a_frame_comes_from_one_cut_in_any_order(scanner, probe, first, m
     scanner.apply_settings(probe, Imaging())
     slicer = scanner.make_frame(POSE, MESH.nodes).slicer
     nodes = pressed(MESH.nodes)
-    plane = probe.plane(POSE)
-    image, labels = slicer.image(nodes, plane), slicer.labels(nodes, plane)
+    plane = probe.make_plane(POSE)
+    image, labels = slicer.cut_image(nodes, plane), slicer.cut_labels(nodes, plane)
     frame, cut, cuts = scanner.make_frame(POSE, nodes), slicer._cut, []
     monkeypatch.setattr(slicer, "_cut", lambda *state: cuts.append(state) or cut(*state))
     getattr(frame, first)
