@@ -85,16 +85,19 @@ def test_a_blind_exercise_hides_the_truth_and_asks(page, simulator):
         return ""
 
     simulator.nodes.get_node("scorer").set_value = answer
-    steps = [{**STEPS[1], "what": what} for what in ("point 1", "thrombus")]
+    steps = [{**STEPS[1], "what": what} for what in ("point 1", "point 2", "thrombus")]
     page.goto(page.address)
     page.locator("#us-panels").click()
     page.get_by_role("tab", name="Exercise").click()
     until(lambda: scorer.picture.is_watched, "the panel is seen")
     scorer.say(steps, feedback="afterwards")
+    page.get_by_role("button", name="Show the result").wait_for(state="hidden")
     page.get_by_role("button", name="point 1: not compressible").click()
+    page.get_by_role("button", name="point 2: compressible", exact=True).click()
     page.get_by_role("button", name="thrombus: at 1", exact=True).click()
-    until(lambda: len(asked) == 2, "it is answered")
-    assert asked == [("answers", ["not compressible"]), ("thrombus", "1")]
+    until(lambda: len(asked) == 3, "it is answered")
+    both = ["not compressible", "compressible"]  # the scorer has not told of the first yet
+    assert asked == [("answers", both[:1]), ("answers", both), ("thrombus", "1")]
     page.get_by_role("tab", name="Tissue").wait_for(state="hidden")
     page.get_by_role("button", name="Outlines").wait_for(state="hidden")
     scorer.say([{**step, "state": "done"} for step in steps], feedback="afterwards")

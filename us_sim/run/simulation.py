@@ -16,6 +16,7 @@ from us_sim.run.supervision import Supervisor, print_above_bar
 from us_sim.scene.building import load_path
 from us_sim.scene.listing import ListedScene, describe_scene, list_scenes
 from us_sim.scene.reading import check_files, load_scene
+from us_sim.scene.scene import EXERCISE_PREFIX
 from us_sim.share import find_bag, full_path, shared_roots
 
 _BAGS_EVERY_S = 2.0
@@ -38,7 +39,9 @@ class Simulation:
         self._settled: RunRequest | None = None  # the last with which all nodes were ready
         self._supervisor = supervisor
         self._asked: SessionControlSettings | None = None  # scene that is to be loaded
-        self._unlisted = chain([describe_scene(request.scene.origin)], list_scenes())
+        origin = request.scene.origin
+        first = [] if origin.startswith(EXERCISE_PREFIX) else [describe_scene(origin)]
+        self._unlisted = chain(first, list_scenes())  # a lesson stays in its order
         self._listed: dict[str, ListedScene] = {}  # by what loads it
         self._bags_at = 0.0
         self._bags: dict[str, str] = {}

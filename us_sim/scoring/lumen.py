@@ -126,7 +126,7 @@ class LumenMeter:
         cuts = np.array(self._cuts[begin:end]).transpose(1, 2, 0)
         depths = np.array(self._depths[begin:end])
         return {
-            name: VesselSection(times, now[k], rest[k], *cuts[k], depths)
+            name: VesselSection(times, now[k], rest[k], cuts[k, 0], cuts[k, 1], depths)
             for k, name in enumerate(self._lumens)
         }
 

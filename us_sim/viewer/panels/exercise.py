@@ -12,7 +12,13 @@ from nicegui.element import Element
 
 from us_sim.scene.listing import ListedScene
 from us_sim.scoring.settings import ANSWERS, NO_ANSWER, NO_THROMBUS, STATES
-from us_sim.viewer.panels.asking import enable_control, find_refusal, is_taken, set_parameter
+from us_sim.viewer.panels.asking import (
+    ask_session,
+    enable_control,
+    find_refusal,
+    is_taken,
+    set_parameter,
+)
 from us_sim.viewer.panels.controls import WhileShown
 from us_sim.viewer.panels.session import ask_to_load, is_confirmed
 from us_sim.viewer.score import PICTURE, SCORE, get_score, is_blind
@@ -48,6 +54,8 @@ class ExercisePanel:
         self._listed: tuple[object, ...] = ()  # exercises that are shown
         self._parts: dict[Element, Any] = {}  # content of the panel's parts as drawn
         self._picture = b""
+        self._begun: str | None = None  # the attempt that is shown, by the time of its begin
+        self._given: list[str] = []  # answers on its points that were clicked here
         with WhileShown(self._begin, self._end, EVERY_S, self._refresh):
             self._choice = ui.expansion("Exercises").classes("us-cases-more")
             with self._choice:
@@ -60,6 +68,7 @@ class ExercisePanel:
             self._steps = ui.column().classes("us-steps")
             self._faults = ui.column().classes("us-steps us-session-problem")
             with ui.row() as self._buttons:
+                self._after: list[ui.button] = []  # of which nothing is told before the end
                 for label, title, work in (
                     ("Begin anew", "Forget what was done so far", self._clear),
                     ("Show the result", "A picture of what was done so far", self._draw),
@@ -67,6 +76,8 @@ class ExercisePanel:
                 ):
                     button = ui.button(label, on_click=work).props("flat dense no-caps")
                     button.props["title"] = title
+                    self._after.append(button)
+                del self._after[0]
             self._plain = ui.grid(columns=2).classes("us-metrics")
             self._image = ui.image().classes("us-score-picture").props("no-spinner")
             self._image.props["alt"] = _ALT
@@ -143,8 +154,12 @@ class ExercisePanel:
         count = "" if is_blind(score) else f": {sum(done)} of {len(done)} done"
         self._result.set_text(f"{state}{count}{clock}" if done else "")
         self._buttons.set_visibility(bool(name) and not self._only_watches)
+        for button in self._after:
+            button.set_visibility(not is_blind(score))
+        if score.get("about", {}).get("begun") != self._begun:
+            self._begun, self._given = score.get("about", {}).get("begun"), []
         parts: list[tuple[Element, Callable[..., None], tuple[Any, ...]]] = [
-            (self._steps, self._draw_steps, (steps, asks)),
+            (self._steps, self._draw_steps, (steps, asks, tuple(self._find_answers()))),
             (self._faults, _draw_faults, (score.get("faults", []),)),
             (self._plain, _draw_metrics, (score.get("plain", {}),)),
             (self._metrics, _draw_metrics, (score.get("metrics", {}),)),
@@ -156,7 +171,14 @@ class ExercisePanel:
                     draw(*shown)
                 self._parts[part] = shown
 
-    def _draw_steps(self, steps: Sequence[Mapping[str, Any]], asks: bool) -> None:
+    def _find_answers(self) -> list[str]:
+        """Return the answers on points so far: those clicked here, or those that the scorer has."""
+        known = self._scorer.parameters.get("answers")
+        return [*self._given] or [each for each in (known.raw if known is not None else ()) if each]
+
+    def _draw_steps(
+        self, steps: Sequence[Mapping[str, Any]], asks: bool, answers: Sequence[str]
+    ) -> None:
         for number, step in enumerate(steps):
             word, icon = _LOOKS[step["state"]]
             with ui.row(wrap=False).classes("us-step") as row:
@@ -164,16 +186,19 @@ class ExercisePanel:
                 ui.icon(icon)
                 ui.label(f"{word}: {step['what']}, {step['seen']}")
             if asks and step["state"] == "to do":
-                self._ask(number, step["what"], len(steps))
+                given = answers[number] if number < len(answers) else ""
+                self._ask(number, step["what"], len(steps), given)
 
-    def _ask(self, number: int, what: str, count: int) -> None:
+    def _ask(self, number: int, what: str, count: int, given: str) -> None:
         """Build the buttons by which the learner answers on a point, or on the thrombus."""
         points = [f"{k + 1}" for k in range(count - 1)]
         is_last = number == len(points)
         with ui.row().classes("us-answers"):
             for answer in (NO_THROMBUS, *points) if is_last else ANSWERS:
                 label = f"at {answer}" if answer.isdigit() else answer
-                button = ui.button(label).props("outline dense no-caps size=sm")
+                button = ui.button(label).props("dense no-caps size=sm")
+                button.props("unelevated" if answer == given else "outline")
+                button.props["aria-pressed"] = str(answer == given).lower()
                 button.on_click(lambda answer=answer: self._answer(number, answer, is_last))
                 button.props["aria-label"] = f"{what}: {label}"
 
@@ -181,11 +206,13 @@ class ExercisePanel:
         if is_last:
             refusal = await set_parameter(self._scorer, "thrombus", answer)
         else:
-            known = self._scorer.parameters.get("answers")
-            answers = [each for each in known.raw if each] if known is not None else []
+            answers = self._find_answers()
             answers += [NO_ANSWER] * (number + 1 - len(answers))
             answers[number] = answer
+            self._given = answers  # the next click comes before the scorer has told of this one
             refusal = await set_parameter(self._scorer, "answers", answers)
+            if refusal:
+                self._given = []
         is_taken(refusal)
 
     async def _clear(self) -> None:
@@ -193,7 +220,12 @@ class ExercisePanel:
         if not is_taken(find_refusal()):
             return
         sentence = f"It ends the attempt at {score.get('name', '')}."
-        if score.get("state") != "running" or await is_confirmed("Begin anew", sentence):
+        if score.get("state") == "running" and not await is_confirmed("Begin anew", sentence):
+            return
+        if score.get("about", {}).get("feedback") == "afterwards":  # another arm: this one is known
+            origin = self._board.state.origin.partition("#")[0]
+            is_taken(await ask_session(self._board, scene=origin))
+        else:
             self._simulator.ask_scorer("clear")
 
     async def _draw(self) -> bool:
