@@ -113,7 +113,7 @@ def test_a_thrombus_in_a_cases_vein_keeps_it_open_and_an_exercise_knows_of_it(tm
             write_volume(folder / "volume.nrrd", volume)
             write_labels(folder / "labels.nrrd", volume)
             write_case_settings(folder, settings)
-    (tmp_path / "e.yaml").write_text("name: e\ntask: {kind: compression, margin: 20 mm}\n")
+    (tmp_path / "e.yaml").write_text("name: e\ntask: {kind: compression, points: 1}\n")
     exercise = read_exercise(tmp_path / "e.yaml")
     seen = {}
     for name in ("clot", "free"):

@@ -25,6 +25,8 @@ _ENCODINGS: dict[str, tuple[int, str]] = {
     "rgba8": (4, "RGBA2{}"),
     **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, _YUYV)),
     **dict.fromkeys(("yuv422", "uyvy"), (2, "YUV2{}_UYVY")),
+    "nv12": (1, "YUV2{}_NV12"),
+    "nv21": (1, "YUV2{}_NV21"),
     **{f"bayer_{name}8": (1, f"Bayer{code}2{{}}") for name, code in _BAYER.items()},
     **{f"bayer_{name}16": (2, f"Bayer{code}2{{}}") for name, code in _BAYER.items()},
 }
@@ -52,7 +54,7 @@ def decode_image(message: Any, colours: str) -> NDArray[np.uint8]:
     size, conversion = _ENCODINGS[encoding]
     code = getattr(cv2, f"COLOR_{conversion.format(colours)}", None)  # none of RGB to itself
     try:
-        pixels = np.ascontiguousarray(rows_from(message, size))
+        pixels = np.ascontiguousarray(_read_rows(message, size))
     except VolumeError as error:
         raise TrackingError(str(error)) from None
     if encoding.endswith(("16", "16UC1")):
@@ -67,6 +69,22 @@ def decode_image(message: Any, colours: str) -> NDArray[np.uint8]:
         raise TrackingError(
             f"an image of {message.width} × {message.height} pixels cannot be {encoding}"
         ) from error
+
+
+def _read_rows(message: Any, size: int) -> NDArray[np.uint8]:
+    """Return the bytes row by row, those of colours after those of grey."""
+    rows = rows_from(message, size)
+    if not message.encoding.startswith("nv"):
+        return rows
+    step = int(message.step) or int(message.width)
+    count = int(message.height) * 3 // 2
+    if len(message.data) < count * step:
+        raise VolumeError(
+            f"the image holds {len(message.data)} bytes, but {message.encoding} of its size has "
+            f"{count * step}"
+        )
+    flat = np.frombuffer(message.data, dtype=np.uint8, count=count * step)
+    return flat.reshape(count, step)[:, : message.width]
 
 
 def _to_8_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
