@@ -62,6 +62,12 @@ def count_markers(name: str) -> int:
     return int(load_dictionary(name).bytesList.shape[0])
 
 
+def find_largest_dictionary(name: str) -> str:
+    """Return the largest dictionary that has this one's markers under the same numbers."""
+    bits, _, count = name.rpartition("_")
+    return f"{bits}_1000" if count.isdigit() else name
+
+
 def compute_square_corners(size: float) -> NDArray[np.float64]:
     """Return the corners (4, 3) m of a marker's black square about its middle, in OpenCV's order.
 

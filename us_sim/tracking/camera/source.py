@@ -30,7 +30,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.spelling import format_count
 from us_sim.tracking.camera.body_pose import BodyPose, PlaneAmbiguity, estimate_body_poses
 from us_sim.tracking.camera.fiducial_detector import Detection, FiducialDetector
-from us_sim.tracking.camera.markers import load_dictionary
+from us_sim.tracking.camera.markers import find_largest_dictionary, load_dictionary
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rigid_body import RigidBody
 from us_sim.tracking.measurement import Measurement
@@ -239,7 +239,20 @@ class CameraSource:
         start = f"no marker of the body ({self.body.dictionary}) is in the image"
         if int(image.max()) <= _BLACK:
             return f"{start}, which is black: uncover the lens or add light"
-        return start
+        others = self._find_others(image)
+        if not others:
+            return start
+        listed = ", ".join(str(number) for number in others[:5])
+        markers = format_count(len(others), "marker")
+        return f"{start}, only {markers} that the body lacks ({listed}): check the body's numbers"
+
+    def _find_others(self, image: NDArray[np.uint8]) -> list[int]:
+        """Return the numbers of markers in the image that the body lacks."""
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.errorCorrectionRate = 0.0
+        known = load_dictionary(find_largest_dictionary(self.body.dictionary))
+        ids = cv2.aruco.ArucoDetector(known, parameters).detectMarkers(image)[1]
+        return [] if ids is None else np.unique(np.asarray(ids, dtype=np.int64)).tolist()
 
 
 _PATIENCE_MS = 5000  # with a stream that is not there or sends nothing
