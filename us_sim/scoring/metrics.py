@@ -23,6 +23,16 @@ _Array = NDArray[np.float64]
 _MM, _MM2, _DEGREES = 1e3, 1e6, float(np.rad2deg(1.0))
 
 
+DEFINITIONS = {
+    "Elapsed Time": "from the first pose to the last",
+    "Path Length": "sum of the steps between poses",
+    "Rotation Total": "sum of the shorter turns between poses",
+    "Time in Contact": f"while the force is at least {CONTACT_FORCE:g} N",
+    "Smallest Part of the Area at Rest": "of the vessel in the same plane without pressure",
+}
+"""Definitions of metrics whose names do not say all."""
+
+
 @dataclass(frozen=True)
 class Metric:
     """One value of a table."""

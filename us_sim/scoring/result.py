@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from us_sim.scoring.live import Score
-from us_sim.scoring.metrics import Metric
+from us_sim.scoring.metrics import DEFINITIONS, Metric
 from us_sim.scoring.settings import STATES
 
 MARKS = {"done": "✓", "missed": "✗", "to do": "○"}
@@ -67,6 +67,7 @@ def render_page(result: Mapping[str, Any], picture: bytes = b"") -> str:
     title = escape(result["name"])
     steps = [(MARKS[s["state"]], s["what"], s["seen"]) for s in result["steps"]]
     faults = [(f"{each['seconds']} s", each["what"]) for each in result["faults"]]
+    more = [(label, text, _define(label)) for label, text in result["metrics"].items()]
     shown = f'<img src="{encode_picture(picture)}" alt="{_ALT}">' if picture else ""
     return (
         f'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
@@ -76,13 +77,18 @@ def render_page(result: Mapping[str, Any], picture: bytes = b"") -> str:
         f"{_table(result['plain'].items(), 'plain')}{_table(steps)}"
         f"{'<h2>Faults</h2>' if faults else ''}{_table(faults, 'fault')}{shown}"
         f"<h2>About</h2>{_table(result['about'].items())}"
-        f"<details><summary>More</summary>{_table(result['metrics'].items())}</details></html>"
+        f"<details><summary>More</summary>{_table(more)}</details></html>"
     )
 
 
 def encode_picture(picture: bytes) -> str:
     """Return a PNG as a data URL."""
     return f"data:image/png;base64,{base64.b64encode(picture).decode()}"
+
+
+def _define(label: str) -> str:
+    """Return the definition of the metric whose name a label begins with; "" if it needs none."""
+    return next((text for name, text in DEFINITIONS.items() if label.startswith(name)), "")
 
 
 def _table(rows: Iterable[Sequence[str]], kind: str = "") -> str:
