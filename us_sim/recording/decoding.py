@@ -94,11 +94,7 @@ _FARTHEST_POSE = 1e7
 
 
 def pose_from(message: Any, frame: str | None = None) -> Pose:
-    """Return the pose in a message.
-
-    Args:
-        message: of any device or node.
-        frame: that it must be in; None is any.
+    """Return the pose in a message, of any frame or of the one that it must be in.
 
     Raises:
         PoseError: it is not finite, beyond any place, or its quaternion has no length to speak of.
@@ -284,11 +280,7 @@ def field_from(message: Any) -> NDArray[np.float32]:
 
 
 def rows_from(message: Any, size: int) -> NDArray[np.uint8]:
-    """Return the bytes of an image, row by row, without padding.
-
-    Args:
-        message: the image.
-        size: bytes of a pixel.
+    """Return the bytes of an image, ``size`` of a pixel, row by row, without padding.
 
     Raises:
         VolumeError: no pixels, or fewer bytes than the stated size.

@@ -1,4 +1,4 @@
-"""Where in a recording a player is, whose pace may change while it plays. Times in ns.
+"""The place of a player in a recording, whose pace may change. Times in ns.
 
 >>> from us_sim.recording.playhead import Playhead
 >>> head = Playhead(rate=2.0)

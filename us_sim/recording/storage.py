@@ -21,7 +21,7 @@ _SQLITE_MAGIC = b"SQLite format 3\0"
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _SUFFIXES = (".mcap", ".db3")
 _NUMBERS = re.compile(r"^\d+_|_[\d_-]+(?=\.)")
-"""What tells the files of a bag apart: BAG_1.mcap, or 1_BAG_2026_06_24-10_00_00.mcap in Lyrical."""
+"""Parts that tell a bag's files apart: BAG_1.mcap, or 1_BAG_2026_06_24-10_00_00.mcap in Lyrical."""
 
 
 class SqliteStorage:

@@ -30,8 +30,8 @@ class WriteBehind:
 
     Args:
         bag: open, and used by nobody else from now on.
-        max_cache_size: bytes of messages that may wait to be written; 0 makes `put_message` wait for the
-            disk instead of losing any, unless the disk is full.
+        max_cache_size: bytes of messages that may wait to be written; 0 makes `put_message` wait
+            for the disk instead of losing any, unless the disk is full.
     """
 
     def __init__(self, bag: BagWriter, max_cache_size: int) -> None:

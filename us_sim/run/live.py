@@ -142,14 +142,11 @@ def dry_run(request: RunRequest) -> str:
     rows.append((RECORDER, record is not None, f"records to {record}" if record else "no --record"))
     page = f"serves a page at {view.host}, port {view.port or 'any'}" if view else "no --view"
     rows.append((VIEWER, view is not None, page))
-    return "\n".join(
-        [
-            f"scene {scene.name} ({scene.origin}), volume {scene.volume.name}",
-            *(f"{'runs' if runs else 'left out':<9} {node:<19} {why}" for node, runs, why in rows),
-            "on demand wrench, tf, markers, annotated image, what is known of images: nothing is "
-            "computed for a topic nobody subscribes",
-        ]
-    )
+    lines = [f"scene {scene.name} ({scene.origin}), volume {scene.volume.name}"]
+    lines += [f"{'runs' if runs else 'left out':<9} {node:<19} {why}" for node, runs, why in rows]
+    on_demand = "wrench, tf, markers, annotated image, what is known of images"
+    lines.append(f"on demand {on_demand}: nothing is computed for a topic nobody subscribes")
+    return "\n".join(lines)
 
 
 def run_scene(request: RunRequest, supervision: SupervisionSettings) -> int:

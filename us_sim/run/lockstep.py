@@ -61,12 +61,9 @@ def render_scene(request: RunRequest, out: Path, *, truth: bool = False) -> int:
 
 
 def _make_truth_folders(scene: Scene, out: Path) -> dict[str, Path]:
-    """Return folders in ``out`` for all that can be known of the scene's images.
+    """Return folders in ``out`` for all that can be known of the scene's images, or refuse.
 
     Beside the labels goes a table of what their numbers mean, ``labels.csv``.
-
-    Raises:
-        UsSimError: nothing is known of them.
     """
     volume = load_volume(scene)
     folders = {}
@@ -110,11 +107,7 @@ def _run(processes: list[NodeProcess], progress: Callable[[int], None], truth: l
 
 
 def _make_node(process: NodeProcess, context: Any) -> Any:
-    """Make a node in this process.
-
-    Raises:
-        UsSimError: a parameter is refused, or what the node itself refuses.
-    """
+    """Make a node in this process; say why it refuses a parameter."""
     from rclpy.exceptions import ParameterException
     from rclpy.parameter import Parameter
 

@@ -82,6 +82,21 @@ class RunRequest:
             raise SceneError(f"{self.scene.origin}: path: is missing; name a bag with --path")
         return replace(self, path=Path(self.scene.path))
 
+    def with_tracker_file(self) -> RunRequest:
+        """Return the same with the recording that is the scene's tracker, its end held.
+
+        Raises:
+            SceneError: the scene does not name it.
+        """
+        tracker = self.scene.tracker
+        if tracker.source.name != "path" or self.by_hand or self.path is not None:
+            return self
+        if tracker.file is None:
+            raise SceneError(
+                f"{self.scene.origin}: tracker.file: is missing; name the bag or recording to play"
+            )
+        return replace(self, path=Path(tracker.file), playing={"stay": True})
+
     def with_scene(self, scene: Scene) -> RunRequest:
         """Return a request of another scene, in which nothing is recorded or played yet.
 
@@ -108,6 +123,7 @@ class Plan:
 
     @property
     def nodes(self) -> list[str]:
+        """The names of its nodes, in the order in which they start."""
         return [process.node for process in self.processes]
 
 
@@ -150,14 +166,7 @@ def make_plan(request: RunRequest) -> Plan:
     Raises:
         UsSimError: a parameter will not do, or the file to be played cannot be, or is not named.
     """
-    tracker = request.scene.tracker
-    if tracker.source.name == "path" and not (request.by_hand or request.path):
-        if tracker.file is None:
-            raise SceneError(
-                f"{request.scene.origin}: tracker.file: is missing; name the bag or recording to "
-                f"play"
-            )
-        request = replace(request, path=Path(tracker.file), playing={"stay": True})
+    request = request.with_tracker_file()
     scene, given = request.scene, dict(request.parameters)
     played = "" if request.path is None else str(full_path(request.path))
 
@@ -169,29 +178,25 @@ def make_plan(request: RunRequest) -> Plan:
         processes.append(plan_viewer(request.view, taken(VIEWER)))
     recorder = taken(RECORDER) if request.record is not None or request.is_changed else {}
     player = taken("path_player") if played or request.is_changed else {}
-    settings: dict[str, object]
     if played and request.everything:
         running = ["diagnostics", "session/scenes", "session/bags"]
         running += [f"/{name}" for name in running]  # of a session without namespace
-        settings = {"path": played, "exclude": running, **request.playing}
-        processes.append(NodeProcess("session_player", settings))
+        exclude = {"path": played, "exclude": running, **request.playing}
+        processes.append(NodeProcess("session_player", exclude))
         return Plan(processes, duration=request.duration, player="session_player")
-    common: dict[str, object] = {"scene": scene.origin}
-    if scene.volume.file:
-        common["volume"] = scene.volume.file
+    volume = {"volume": scene.volume.file} if scene.volume.file else {}
+    common: dict[str, object] = {"scene": scene.origin, **volume}
     if request.record is not None:
-        settings = {"file": str(full_path(request.record)), **common}
-        settings |= {"path": played} if played else {}
-        recorder = settings | recorder
+        source = {"path": played} if played else {}
+        recorder = {"file": str(full_path(request.record)), **common, **source, **recorder}
         processes.append(NodeProcess(RECORDER, recorder))
     needed = [part.node for part in scene.list_parts() if part.needed]
-    for node in needed:
-        is_played = node == "probe_tracker" and (played or request.by_hand)
-        source = {"source": "pose"} if is_played else {}
-        kept: dict[str, object] = {}
-        if node == "scorer" and request.results:
-            kept = {"student": request.student, "results": request.results}
-        processes.append(NodeProcess(node, common | source | kept | taken(node)))
+    own: dict[str, dict[str, object]] = {}
+    if played or request.by_hand:
+        own["probe_tracker"] = {"source": "pose"}
+    if request.results:
+        own["scorer"] = {"student": request.student, "results": request.results}
+    processes += [NodeProcess(node, common | own.get(node, {}) | taken(node)) for node in needed]
     if given:
         raise UsSimError(
             f"--param {next(iter(given))}: this scene does not run such a node; it runs "
@@ -203,6 +208,15 @@ def make_plan(request: RunRequest) -> Plan:
     if request.path is None:
         return Plan(processes, duration=request.duration)
     path = load_path(scene, request.path, request.topic or str(player.get("topic") or "") or None)
+    settings = {"path": played, "topic": path.topic, **_await_scene(scene, processes)}
+    settings |= request.playing
+    poses = None if settings.get("stay") else len(path)
+    processes.append(NodeProcess("path_player", settings | player))
+    return Plan(processes, poses, request.duration, topic=path.topic)
+
+
+def _await_scene(scene: Scene, processes: Iterable[NodeProcess]) -> dict[str, object]:
+    """Return the topics without which a path is not played, and those the recorder must hear."""
     topics, space = ["tracker/pose", *scene.ready_topics], get_namespace()
     recording = find_recorder(processes)
     recorded = [
@@ -210,12 +224,7 @@ def make_plan(request: RunRequest) -> Plan:
         for each in topics
         if recording and recording.records_topic(posixpath.join(space, each), space)
     ]
-    settings = {"path": played, "topic": path.topic, "await_topics": topics}
-    settings |= {"await_recorded": recorded or [""], **request.playing}  # [] has no type
-    poses = None if settings.get("stay") else len(path)
-    settings |= player
-    processes.append(NodeProcess("path_player", settings))
-    return Plan(processes, poses, request.duration, topic=path.topic)
+    return {"await_topics": topics, "await_recorded": recorded or [""]}  # [] has no type
 
 
 def plan_viewer(view: ViewerSettings, given: dict[str, object] | None = None) -> NodeProcess:

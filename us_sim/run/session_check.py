@@ -122,10 +122,8 @@ class TopicCheck:
         if lost := missing or said:
             where = f", as the recorder counted {said}" if said else ""
             remedy = "a larger max_cache_size, and its publisher a depth for a second"
-            self._tell(
-                "loss",
-                f"lacks {format_count(lost, 'message')}{where}: give session_recorder {remedy}",
-            )
+            count = format_count(lost, "message")
+            self._tell("loss", f"lacks {count}{where}: give session_recorder {remedy}")
         return missing
 
     def _check_order(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator
 from decimal import Decimal
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -68,9 +69,8 @@ def write_parts(
         table = head.join(values.rename(columns=_UNITS))
         yield write_table(folder / f"{_file_name(name)}.csv", table, na_rep="nan")
     if "images" in parts:
-        made = [
-            each for name in needed["images"] for each in _write_images(bag, name, folder, progress)
-        ]
+        images = [_write_images(bag, name, folder, progress) for name in needed["images"]]
+        made = [*chain.from_iterable(images)]
         yield from made
         if not any(isinstance(each, Path) for each in made):
             raise BagError(f"{bag.path} holds no image that can be decoded")

@@ -158,10 +158,8 @@ class Track:
             told = f"{images} shown, which are {oldest:.3f} s old at most"
         else:
             between = "slerp" if self.turns else "linear"
-            messages, gap = (
-                format_count(len(self.times), "message"),
-                np.diff(self.times).max() / SECOND,
-            )
+            messages = format_count(len(self.times), "message")
+            gap = np.diff(self.times).max() / SECOND
             told = f"{between} between {messages}, {gap:.3f} s apart at most"
         damaged = [f"{self.damaged} cannot be decoded"] if self.damaged else []
         return "; ".join([f"{self.name}: {told}", *damaged, *self.notes])
@@ -260,17 +258,14 @@ class Episode:
             for feature, tracks in self._numbers.items()
             if tracks
         }
-        images = {  # lerobot allows no slash in a feature's name
-            f"{IMAGES}{each.name.strip('/').replace('/', '_')}": each.read_images(
-                self._bag, moments
-            )
-            for each in self._images
-        }
+        images = {}
+        for each in self._images:  # lerobot allows no slash in a feature's name
+            name = each.name.strip("/").replace("/", "_")
+            images[f"{IMAGES}{name}"] = each.read_images(self._bag, moments)
         for k in range(len(moments)):
             progress(k / len(moments), self._bag.path.name)
-            yield {name: next(pixels) for name, pixels in images.items()} | {
-                name: row[k] for name, row in rows.items()
-            }
+            shown = {name: next(pixels) for name, pixels in images.items()}
+            yield shown | {name: row[k] for name, row in rows.items()}
 
     def describe_use(self, moments: Times) -> Iterator[str]:
         """Say what became of its messages, after the frames were taken."""
@@ -312,11 +307,7 @@ class Episode:
         return Track(name, table, notes, turns=turns)
 
     def _judge_times(self, table: pd.DataFrame) -> tuple[pd.Series, list[str]]:
-        """Give each message its time, ns: its stamp, or when it was recorded; and say what is odd.
-
-        Raises:
-            BagError: one is of another time, as after a clock was set back.
-        """
+        """Give each message its time, ns, and say what is odd; refuse one of another time."""
         stamps = table["logged" if self._by_log_time else "stamp"]
         has_none = stamps == 0
         times = stamps.mask(has_none, table["logged"])

@@ -72,12 +72,7 @@ def read_scan(
 
 
 def _read_force(bag: Bag, topic: str | None, begin: int) -> Force:
-    """Read the force on the probe.
-
-    Raises:
-        BagError: the topic that was named has no wrenches.
-        ScoreError: none was named, and there is none, or several, or no wrench that can be used.
-    """
+    """Read the force on the probe; ScoreError says why there is none that can be used."""
     if topic is None:
         names = list_topics(bag, WRENCH_STAMPED)
         names = [name for name in names if name.endswith("probe/wrench")] or names
@@ -94,11 +89,7 @@ def _read_force(bag: Bag, topic: str | None, begin: int) -> Force:
 
 
 def _measure_vessels(bag: Bag, path: ProbePath, progress: Progress) -> dict[str, Any]:
-    """Measure sections, lines and thrombi of the vessels, at five images a second, 200 in all.
-
-    Raises:
-        UsSimError: there is no scene or image, or a file of the scene is missing or another.
-    """
+    """Measure sections, lines and thrombi of the vessels, at five images a second, 200 or more."""
     if path.topic != POSE:
         raise BagError(f"they are known for the poses on {POSE} only, not {path.topic}")
     with unpack_scene(bag) as scene:

@@ -76,9 +76,8 @@ class Session:
         numbers, scanner = self.find_vessels(scene)
         if scanner is None:
             return None
-        stamps = [
-            each for each in self.list_stamps(IMAGE) if each in self.nodes and each in self.poses
-        ]
+        known = self.nodes.keys() & self.poses.keys()
+        stamps = [each for each in self.list_stamps(IMAGE) if each in known]
         if not stamps:
             raise BagError(
                 "the session holds no image with its pose and nodes, so nothing can be measured: "
@@ -89,9 +88,8 @@ class Session:
         picked = np.linspace(0, len(stamps) - 1, min(samples, len(stamps))).astype(int).tolist()
         for k, stamp in enumerate((stamps[at] for at in picked), 1):
             pose = self.poses[stamp]
-            meter.add_image(
-                (stamp - first) / SECOND, pose, scanner.render_labels(pose, self.nodes[stamp])
-            )
+            labels = scanner.render_labels(pose, self.nodes[stamp])
+            meter.add_image((stamp - first) / SECOND, pose, labels)
             progress(k / len(picked))
         return meter
 

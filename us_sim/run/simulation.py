@@ -102,11 +102,8 @@ class Simulation:
         if _OF_SCENE & set(named):
             self._asked = wanted  # to be loaded after this has been answered
             return
-        request = replace(
-            self._request,
-            record=full_path(wanted.record) if wanted.record else None,
-            is_changed=True,
-        )
+        record = full_path(wanted.record) if wanted.record else None
+        request = replace(self._request, record=record, is_changed=True)
         if not wanted.replay:
             request = request.without_replay()
         elif {"replay", "replay_as", *_OF_PLAYER} & set(named):

@@ -264,13 +264,12 @@ class Supervisor:
         recorded_by = node.recordings.items()
         files = [Path(file) for file, pid in recorded_by if (RECORDER, pid) in self._started]
         # How many images were to be recorded is only known where all that were made were.
-        recorder = find_recorder(self.plan.processes)
-        all_were = (
+        recorder = find_recorder(self.plan.processes) if files and self._changes == 1 else None
+        if (
             recorder
             and not recorder.paused
             and recorder.records_topic(self._images, get_namespace())
-        )
-        if files and all_were and self._changes == 1:
+        ):
             made, recorded = node.count_messages(IMAGER, IMAGES), count_images(files, self._images)
             if recorded < made:
                 losses.insert(0, f"{recorded} images were recorded of {made} that were made")
@@ -301,17 +300,16 @@ class Supervisor:
             silent = self._watched - running.heard_at
             if count != running.reports:
                 running.reports, running.heard_at = count, self._watched
-            elif silent > self._patience(node, count):
+            elif silent > (self._settings.silence if count else self._patience(node)):
                 if node not in self._were_ready:
                     raise UsSimError(f"{node} did not start in {START_S / 60:g} minutes")
                 said = self.monitor.messages.get(node) or running.last_words
                 self._end([node])
                 self._on_lost(node, f"has not reported for {silent:.0f} s", said)
 
-    def _patience(self, node: str, reports: int) -> float:
-        """Return how long (s) a node may be silent that has reported so often."""
-        first = max(RESTART_S, self._settings.silence) if node in self._were_ready else START_S
-        return self._settings.silence if reports else first
+    def _patience(self, node: str) -> float:
+        """Return how long (s) a node may take to its first report."""
+        return max(RESTART_S, self._settings.silence) if node in self._were_ready else START_S
 
     def _on_lost(self, node: str, what: str, said: str) -> None:
         """Note a node's end, and start it again with the values that it was first started with."""

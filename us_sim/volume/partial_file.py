@@ -15,7 +15,7 @@ from us_sim.errors import UsSimError, VolumeError
 def partial_file(
     path: Path, name: str = "partial", error_type: type[UsSimError] = VolumeError
 ) -> Iterator[Path]:
-    """The path of a file to write, beside another, whose place it takes at the end.
+    """Give the path of a file to write, beside another, whose place it takes at the end.
 
     Args:
         path: of the file at the end; one that is there is replaced.

@@ -20,7 +20,7 @@ _NUMERAL = re.compile(r"\d{1,2}|[ivx]{1,4}[ab]?|[a-d]|[lctsr]\d{1,2}")
 
 
 def is_anatomical(name: str) -> bool:
-    """Whether a name is made of words of anatomy, sides and numbers up to two digits alone."""
+    """Tell whether a name is of words of anatomy, sides and numbers to two digits alone."""
     words = _PHRASES.sub("", make_readable(name).lower()).split()
     others = [word for word in words if word not in _words()]
     return len(others) < len(words) <= 8 and all(map(_NUMERAL.fullmatch, others))
@@ -37,7 +37,7 @@ def _words() -> frozenset[str]:
 
 
 def make_readable(name: str) -> str:
-    """A name with blanks in place of underscores, dots and hyphens, as programs write them."""
+    """Put blanks in place of the underscores, dots and hyphens that programs write."""
     return " ".join(re.sub(r"[_\-.,]+", " ", name).split())
 
 

@@ -21,13 +21,6 @@ class Volume:
     The arrays are kept as read-only views, without a copy where they are already C-contiguous,
     so several processes can use one memory-mapped volume.
 
-    Args:
-        intensities: (i, j, k) uint8, axis 0 along the grid's x.
-        index_to_patient: (4, 4) affine, m, from voxel indices to frame ``patient``; it may be
-            oblique or mirrored.
-        labels: (i, j, k) uint8, the structure of each voxel, or None.
-        label_names: of the labels' numbers; 0 needs no name.
-
     Raises:
         VolumeError: an array is not three-dimensional uint8, the two shapes differ, an axis has
             no voxel, or the affine is not finite or not invertible.
@@ -39,10 +32,10 @@ class Volume:
         ((40, 30, 20), {})
     """
 
-    intensities: NDArray[np.uint8]  # (i, j, k)
-    index_to_patient: NDArray[np.float64]  # (4, 4), m
-    labels: NDArray[np.uint8] | None = None  # (i, j, k)
-    label_names: Mapping[int, str] = field(default_factory=dict)
+    intensities: NDArray[np.uint8]  # (i, j, k), axis 0 along the grid's x
+    index_to_patient: NDArray[np.float64]  # (4, 4) affine, m; it may be oblique or mirrored
+    labels: NDArray[np.uint8] | None = None  # (i, j, k), the structure of each voxel
+    label_names: Mapping[int, str] = field(default_factory=dict)  # by number; 0 needs no name
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "intensities", _voxels(self.intensities, "intensities"))

@@ -84,14 +84,18 @@ class Case:
             )
         return dataclasses.replace(volume, labels=labels, label_names=names)
 
-    def check_grids(self) -> None:
-        """Compare the grid of the labels with the volume's, by their headers.
+    def check_grids(self) -> tuple[NDArray[np.float64], tuple[int, int, int]]:
+        """Compare the grid of labels that there are with the volume's, which is returned.
+
+        Nothing but headers is read; see `read_placement`.
 
         Raises:
             CaseError: they differ, or the labels are not 8-bit.
             VolumeError: a header cannot be used.
         """
         placement, shape = self.read_placement()
+        if not self.has_labels:
+            return placement, shape
         labels = open_image(self.folder / LABELS)
         if labels.type.itemsize != 1:
             raise CaseError(
@@ -107,6 +111,7 @@ class Case:
                 f"there, up to {away * 1e3:.3g} mm apart): segment this volume, or "
                 f"resample the labels"
             )
+        return placement, shape
 
 
 def is_case(folder: str | os.PathLike[str]) -> bool:
@@ -159,9 +164,7 @@ def find_cases(root: Path) -> list[Path]:
 def find_case(name: str | os.PathLike[str], folders: Sequence[Path] = ()) -> Path:
     """Find the folder of a case, by its path or by its name in one of `list_case_roots`.
 
-    Args:
-        name: of the case, or its folder.
-        folders: where a relative path begins; the current folder is the last of them.
+    A relative path begins in one of ``folders``, the last of which is the current one.
 
     Raises:
         CaseError: there is none; the sentence says which there are.
@@ -195,9 +198,7 @@ def list_case(folder: Path) -> ListedCase:
     """Collect the facts of the case in a folder, from its texts and headers alone."""
     try:
         case = read_case(folder)
-        matrix, shape = case.read_placement()
-        if case.has_labels:
-            case.check_grids()
+        matrix, shape = case.check_grids()
     except UsSimError as error:
         return ListedCase(folder.name, problem=str(error))
     voxel = np.linalg.norm(matrix[:3, :3], axis=0) * 1e3

@@ -1,4 +1,4 @@
-"""Where to start and with which probe, for a case that does not say.
+"""A start and a probe for a case that does not say them.
 
 A case that knows where it was scanned from starts at one of these poses, so that its first image
 is one that was really seen: the middle one, or the one that shows most of the structures. Any
@@ -9,9 +9,9 @@ what was scanned, wherever that begins below it.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -51,19 +51,24 @@ def complete_settings(settings: CaseSettings, volume: Volume) -> CaseSettings:
         poses = [each.pose for each in settings.scanned] or [_pose_above(points, volume)]
         seen_by = probe or _probe_at(poses[len(poses) // 2], points)
         pose = _showing_most(settings, volume, poses, seen_by)
-        x, y, z = (round(float(value), 5) for value in pose.position)
-        a, b, c, d = (round(float(value), 6) for value in pose.orientation)
-        at = Placement((x, y, z), (a, b, c, d))
+        at = round_pose(pose)
         at = at if settings.scanned else on_skin(at, volume, seen_by)
         start = CaseStart(at.position, at.orientation, proposed=True)
     probe = probe or _probe_at(start.pose, points)
     if probe.collider is None:
-        probe = dataclasses.replace(probe, collider=propose_collider(probe.array))
-    return dataclasses.replace(settings, start=start, probe=probe)
+        probe = replace(probe, collider=propose_collider(probe.array))
+    return replace(settings, start=start, probe=probe)
+
+
+def round_pose(pose: Pose) -> Placement:
+    """Return a pose to 0.01 mm and a millionth, as a person reads it."""
+    x, y, z = (round(float(value), 5) for value in pose.position)
+    a, b, c, d = (round(float(value), 6) for value in pose.orientation)
+    return Placement((x, y, z), (a, b, c, d))
 
 
 def propose_collider(array: ChosenOption) -> ChosenOption:
-    """The shape of a probe's head around its array, as large as the usual ones are."""
+    """Propose the shape of a probe's head around its array, as large as the usual ones are."""
     given: Any = array.resolve_settings(PROBES)
     if array.name == "convex":
         chord = 2 * given.radius * math.sin(given.opening_angle / 2)
@@ -77,7 +82,7 @@ def propose_collider(array: ChosenOption) -> ChosenOption:
 
 
 def _pose_above(points: NDArray[np.float64], volume: Volume) -> Pose:
-    """The pose of a linear array above the middle of what was scanned (N, 3) m."""
+    """Return the pose of a linear array above the middle of what was scanned (N, 3) m."""
     axes = volume.index_to_patient[:3, :2] / np.linalg.norm(volume.index_to_patient[:3, :2], axis=0)
     across, along = axes.T
     middle = points.mean(axis=0)
@@ -87,7 +92,7 @@ def _pose_above(points: NDArray[np.float64], volume: Volume) -> Pose:
 
 
 def _probe_at(pose: Pose, points: NDArray[np.float64]) -> ProbeSettings:
-    """A linear array as wide and deep as what was scanned, up to 50 mm and 110 mm."""
+    """Return a linear array as wide and deep as what was scanned, up to 50 mm and 110 mm."""
     x, _, z = np.abs((points - pose.position) @ pose.rotation).T
     depth = float(np.clip(np.percentile(z, 99.5), 0.01, 0.11))
     aperture = float(np.clip(2 * np.percentile(x, 99.0), 5e-3, 0.05))
@@ -118,16 +123,14 @@ def on_skin(start: Placement, volume: Volume, probe: ProbeSettings | None) -> Pl
     is_skin = lines[:, : behind.shape[1]] & (behind.mean(axis=2) > 0.5)
     touched = np.flatnonzero(is_skin.any(axis=0))
     depth = depths[touched[0]] if len(touched) else 0.0
-    x, y, z = (
-        round(float(value), 5) for value in pose.transform_points(np.array([[0.0, 0.0, depth]]))[0]
-    )
-    return Placement((x, y, z), start.orientation)
+    face = pose.transform_points(np.array([[0.0, 0.0, depth]]))[0]
+    return replace(start, position=round_pose(Pose(face, pose.orientation)).position)
 
 
 def _showing_most(
     settings: CaseSettings, volume: Volume, poses: Sequence[Pose], probe: ProbeSettings
 ) -> Pose:
-    """The pose whose image and surroundings show most of the structures; else the middle one."""
+    """Find the pose whose image and surroundings show most structures; else the middle one."""
     labels = [
         structure.label
         for name, structure in settings.structures.items()
@@ -150,7 +153,7 @@ def _showing_most(
 
 
 def _places(volume: Volume, there: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Centres (N, 3) m of voxels (i, j, k); of many only every so many along each axis."""
+    """Return centres (N, 3) m of voxels (i, j, k); of many every so many along each axis."""
     step = max(1, math.ceil((there.size / _MOST_POINTS) ** (1 / 3)))
     matrix = volume.index_to_patient
     indices = np.argwhere(there[::step, ::step, ::step]) * step

@@ -24,7 +24,7 @@ RESERVED = (AROUND, *_FACES)  # names that no structure has
 
 
 def check_name(name: str) -> str | None:
-    """The problem with the name of a case or of a structure, which become names of files."""
+    """Return the problem with the name of a case or of a structure, which become names of files."""
     if not name.strip() or len(name) > _LONGEST_NAME or not name.isprintable():
         return f"{short_repr(name)}: a name has 1 to {_LONGEST_NAME} printable characters"
     if set(name) & set('/\\:*?"<>|') or name.startswith(".") or name != name.strip():
@@ -60,7 +60,7 @@ class CaseStructure(Settings):
 
 @dataclass(frozen=True)
 class CaseStart(Placement):
-    """Where a press begins."""
+    """The pose at which a press begins."""
 
     section = "start"
     error = CaseError

@@ -25,7 +25,7 @@ from us_sim.volume.partial_file import partial_file
 
 @contextmanager
 def new_case(folder: str | os.PathLike[str]) -> Iterator[Path]:
-    """A folder to fill, beside that of the new case, which it becomes at the end, when it is one.
+    """Make a folder to fill, which becomes the new case at the end, when it is one.
 
     Parents of the new case's folder are made.
 
@@ -75,9 +75,7 @@ def _finish(folder: Path, partial: Path) -> None:
     """
     try:
         case = read_case(partial)
-        case.read_placement()
-        if case.has_labels:
-            case.check_grids()
+        case.check_grids()
         start = case.settings.start
         if start is None or start.proposed or case.settings.probe is None:
             write_case_settings(partial, complete_settings(case.settings, case.read_volume()))

@@ -69,7 +69,7 @@ class ImportPlan:
 
     @property
     def summary(self) -> str:
-        """What is made and blanked, and what nobody looked at, for a person."""
+        """A sentence on what is made and blanked, and what nobody looked at."""
         columns, rows, count = (*self.part.size, self.source.shape[2])
         steps = np.linalg.norm(self.source.placement[:3, :3], axis=0) * 1e3
         apart = " × ".join(f"{step:.4g}" for step in steps)

@@ -49,8 +49,8 @@ def parse_segments(path: Path, pairs: Mapping[str, str]) -> list[Segment]:
     for key in ("Segmentation_MasterRepresentation", "Segmentation_SourceRepresentation"):
         if (said := pairs.get(key, "Binary labelmap")).lower() != "binary labelmap":
             raise VolumeError(
-                f"{path}: holds segments as {short_repr(said)}; save it with `Binary labelmap` as the "
-                f"source representation"
+                f"{path}: holds segments as {short_repr(said)}; save it with `Binary labelmap` as "
+                f"the source representation"
             )
     found: dict[int, dict[str, str]] = {}
     for key, value in pairs.items():
@@ -188,8 +188,9 @@ def _from_values(
     values = values[values != 0]  # and none is below
     if len(layers) > 1 or len(values) > _MOST:
         raise VolumeError(
-            f"{path}: holds {len(values)} different values and {format_count(len(layers), 'number')} "
-            f"per voxel, so it is no label image; labels are one, and {_MOST} at most"
+            f"{path}: holds {len(values)} different values and "
+            f"{format_count(len(layers), 'number')} per voxel, so it is no label image; labels are "
+            f"one, and {_MOST} at most"
         )
     labels = stored
     if len(values) and values[-1] > _MOST:

@@ -115,5 +115,5 @@ def _numbers(
 
 
 def _is_true(text: str) -> bool:
-    """As MetaIO reads it."""
+    """Tell whether a text is true as MetaIO reads it."""
     return text[:1] in ("T", "t", "1")

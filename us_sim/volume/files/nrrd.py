@@ -102,7 +102,7 @@ def open_nrrd(path: Path) -> StoredImage:
 
 
 def _axes_of_space(fields: Mapping[str, Any], count: int) -> list[int]:
-    """The axes with a direction, or of a kind along which the body extends; else the first 3."""
+    """Find the axes with a direction, or of a kind along which bodies extend; else the first 3."""
     if _DIRECTIONS in fields:
         return [n for n, each in enumerate(fields[_DIRECTIONS]) if not np.isnan(each).all()]
     kinds = fields.get("kinds", ())

@@ -1,4 +1,4 @@
-"""Where the voxels of an image file lie, checked: spacing, axes and origin that a body may have."""
+"""The place of an image file's voxels, checked: spacing, axes and origin that a body may have."""
 
 from __future__ import annotations
 

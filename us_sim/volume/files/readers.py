@@ -71,9 +71,7 @@ def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
 def open_image(path: Path, *, layers: bool = False) -> StoredImage:
     """Describe the image of a MetaImage, NRRD or NIfTI file by its header.
 
-    Args:
-        path: of the file.
-        layers: a voxel may have several numbers, as segmentations of 3D Slicer have.
+    With ``layers`` a voxel may have several numbers, as in segmentations of 3D Slicer.
 
     Raises:
         VolumeError: as `read_volume`, except for faults of the voxels and of where they lie.

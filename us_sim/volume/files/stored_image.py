@@ -64,11 +64,7 @@ class StoredNumbers:
 
 
 def check_memory(needed: float, purpose: str, advice: str = "end other programs") -> None:
-    """Refuse a purpose that takes more bytes than the free memory has.
-
-    Raises:
-        VolumeError: it does.
-    """
+    """Raise VolumeError where a purpose takes more bytes than the free memory has."""
     free = measure_free_memory()
     if needed > free:
         raise VolumeError(
@@ -78,10 +74,9 @@ def check_memory(needed: float, purpose: str, advice: str = "end other programs"
 
 
 def check_claim(path: Path | str, size: tuple[int, ...], value: int) -> None:
-    """Refuse an image of so many numbers along each axis, and so many bytes a number.
+    """Raise VolumeError where so many numbers, of so many bytes, are too many to be read.
 
-    Raises:
-        VolumeError: it is larger than `LARGEST_VOLUME`, or than the memory that is free.
+    Either of `LARGEST_VOLUME` or of the memory that is free.
     """
     count, shown = math.prod(size), " × ".join(map(str, size))
     if count > LARGEST_VOLUME:
@@ -94,13 +89,9 @@ def check_claim(path: Path | str, size: tuple[int, ...], value: int) -> None:
 
 
 def check_brightness(path: Path | str, image: NDArray[Any]) -> None:
-    """Refuse radio-frequency data, which swing about zero along the beam.
+    """Refuse radio-frequency data (j, i), which swing about zero along the beam, on either axis.
 
     Other signed images, such as CT, seldom change sign between neighbours.
-
-    Args:
-        path: which errors name.
-        image: (j, i) of a volume, or of a sequence; beams along either axis.
     """
     if image.dtype.kind not in "if" or image.ndim != 2 or max(image.shape) < 64:
         return
@@ -115,7 +106,7 @@ def check_brightness(path: Path | str, image: NDArray[Any]) -> None:
 
 
 def measure_free_memory() -> float:
-    """Bytes of memory that programs may still take, as Linux estimates it; elsewhere no limit."""
+    """Return the bytes of memory that are free, as Linux estimates it; elsewhere infinity."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
         (available,) = (line for line in lines if line.startswith("MemAvailable:"))
@@ -151,7 +142,7 @@ class StoredImage:
 
     @property
     def volumes(self) -> int:
-        """How many volumes there are one after another."""
+        """The number of volumes, one after another."""
         return self.axes[3] if len(self.axes) == 4 else 1
 
     def require_volume(self, *, layers: bool = False) -> None:
@@ -198,7 +189,7 @@ class GreyLevels:
         return cls(low, high)
 
     def __call__(self, image: NDArray[Any]) -> NDArray[np.uint8]:
-        """An image as grey values; 8-bit ones between 0 and 255 are taken as they are."""
+        """Return an image as grey values; 8-bit ones between 0 and 255 are taken as they are."""
         if image.dtype == np.uint8 and (self.low, self.high) == (0.0, 255.0):
             return np.array(image, dtype=np.uint8)
         # Halves, since the whole range of a float64 image may exceed what float64 can hold.
@@ -232,7 +223,7 @@ def read_grey_voxels(
 
 
 def stack_slices(slices: Iterable[NDArray[np.uint8]], count: int) -> NDArray[np.uint8]:
-    """A volume (i, j, k) of slices (j, i), of which so many come.
+    """Stack a volume (i, j, k) of slices (j, i), of which so many come.
 
     The first is read before memory is taken for all.
     """

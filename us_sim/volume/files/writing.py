@@ -8,9 +8,10 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import SimpleITK as sitk
+import SimpleITK
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
@@ -31,9 +32,7 @@ def write_volume(path: str | os.PathLike[str], volume: Volume) -> None:
     Spacing, origin and direction are those of ``index_to_patient`` in millimetres, on DICOM's
     left-posterior-superior axes. NRRD and MetaImage hold them to 17 digits; NIfTI to 7.
 
-    Args:
-        path: ends in .nrrd, .mha, .nii or .nii.gz.
-        volume: its labels are not written here; see `write_labels`.
+    Its labels are not written here; see `write_labels`.
 
     Raises:
         VolumeError: the name ends otherwise, the grid has no right angles, or the file cannot be
@@ -119,8 +118,8 @@ def _write_image(
     direction = matrix[:3, :3] / spacing
     if not is_right_angled(direction):
         raise VolumeError(
-            f"{path}: the volume's axes are {measure_skew(direction):.2g}° off a right angle, which "
-            f"image files cannot hold; resample it on a grid with right angles"
+            f"{path}: the volume's axes are {measure_skew(direction):.2g}° off a right angle, "
+            f"which image files cannot hold; resample it on a grid with right angles"
         )
     ending = next((end for end in VOLUME_ENDINGS if path.name.lower().endswith(end)), None)
     if ending is None:
@@ -131,17 +130,18 @@ def _write_image(
 
             affine = np.diag([-1.0, -1.0, 1.0, 1.0]) @ matrix
             affine[3] = (0.0, 0.0, 0.0, 1.0)
-            nifti = nibabel.Nifti1Image(voxels, affine)  # type: ignore[attr-defined,no-untyped-call]
+            pair: Any = nibabel
+            nifti = pair.Nifti1Image(voxels, affine)
             nifti.header.set_xyzt_units("mm")
             nifti.to_filename(partial)
         else:
-            image = sitk.GetImageFromArray(voxels.transpose(2, 1, 0))
+            image = SimpleITK.GetImageFromArray(voxels.transpose(2, 1, 0))
             image.SetSpacing(spacing.tolist())
             image.SetOrigin(matrix[:3, 3].tolist())
             image.SetDirection(direction.ravel().tolist())
             for key, value in fields.items():
                 image.SetMetaData(key, value)
             try:
-                sitk.WriteImage(image, str(partial), packed, _LEVEL)
+                SimpleITK.WriteImage(image, str(partial), packed, _LEVEL)
             except RuntimeError as error:
                 raise VolumeError(f"{path}: cannot be written: the disk may be full") from error

@@ -31,7 +31,7 @@ def make_upper_arm(
     *,
     thrombus: tuple[float, float] | None = None,
 ) -> Volume:
-    """A labelled upper arm with the skin at z = 0: its echoes over 60 dB, without any loss.
+    """Make a labelled upper arm, its skin at z = 0, and its echoes over 60 dB without loss.
 
     The same seed and voxel size give the same bytes with the same NumPy and SciPy (bit generator
     PCG64); another voxel size shows the same anatomy with other speckle.
@@ -107,11 +107,7 @@ thrombosed_arm = partial(make_upper_arm, thrombus=(-9e-3, 9e-3))
 def draw_arm(seed: int = 1, voxel_size: float = 0.3e-3, progress: Progress | None = None) -> Volume:
     """Make an arm whose seed decides, too, whether a thrombus is in its vein, and where.
 
-    Args:
-        seed, voxel_size, progress: as for `make_upper_arm`.
-
-    Raises:
-        VolumeError: as `make_upper_arm`.
+    All else is as for `make_upper_arm`.
     """
     return make_upper_arm(seed, voxel_size, progress, thrombus=draw_thrombus(seed))
 
@@ -131,20 +127,14 @@ def draw_thrombus(seed: int) -> tuple[float, float]:
 def load_or_make_phantom(
     name: str, seed: int = 1, voxel_size: float = 0.3e-3, progress: Progress | None = None
 ) -> Volume:
-    """A phantom from the user's cache folder, made there first if it is not in it yet.
+    """Load a phantom from the user's cache folder, made there first if it is not in it yet.
 
     Its arrays are memory-mapped, one copy for all processes. Processes that ask at once wait for
-    the one that makes it; a damaged entry is made again, and a warning is logged.
-
-    Args:
-        name: one of PHANTOMS.
-        seed: see the phantom.
-        voxel_size: m.
-        progress: told the fraction done and the work in progress; not called where the phantom is
-            in the cache already.
+    the one that makes it; a damaged entry is made again, and a warning is logged. ``progress`` is
+    told the fraction done and the work in progress while a phantom is made.
 
     Raises:
-        VolumeError: there is no such phantom, or the seed or voxel size is out of its range.
+        VolumeError: ``name`` is none of PHANTOMS, or the seed or voxel size (m) is out of range.
 
     Examples:
         >>> arm = load_or_make_phantom("upper_arm", seed=1, voxel_size=2e-3)
@@ -157,22 +147,20 @@ def load_or_make_phantom(
 
 
 def is_phantom_cached(name: str, seed: int, voxel_size: float) -> bool:
-    """Whether a phantom is in the user's cache folder; it may be damaged."""
+    """Tell whether a phantom is in the user's cache folder; it may be damaged."""
     return (cache_folder() / _key(name, seed, voxel_size)).is_dir()
 
 
 def load_or_make_volume(key: str, make: Callable[[], Volume]) -> Volume:
-    """The labelled volume cached under a key, made first if it is not there.
+    """Load the labelled volume cached under a key, made first by one process if it is not there.
 
-    Args:
-        key: a file name that contains everything on which the volume's bytes depend.
-        make: makes the volume; called by one process at a time.
+    The key is a file name that contains everything on which the volume's bytes depend.
     """
     return load_or_create(key, _pack, _unpack, make)
 
 
 def _key(name: str, seed: int, voxel_size: float) -> str:
-    """A file name of all that decides the phantom's bytes."""
+    """Return a file name of all that decides the phantom's bytes."""
     decided_by = f"{name} {_GENERATOR} {int(seed)} {float(voxel_size)!r}"
     return f"{name}-{hashlib.sha256(decided_by.encode()).hexdigest()[:16]}"
 

@@ -42,7 +42,7 @@ class PointSpread:
     elevational_range: float = 20e-3
 
     def compute_widths(self, depth: float) -> tuple[float, float]:
-        """Lateral and elevational full width at half maximum at a depth, m."""
+        """Return the lateral and elevational full width at half maximum at a depth, m."""
         away = depth - self.focus
         return (
             self.lateral * math.hypot(1.0, away / self.lateral_range),
@@ -50,7 +50,7 @@ class PointSpread:
         )
 
     def compute_reach(self, depth: NDArray[np.float64]) -> tuple[float, float, float]:
-        """How far (x, y, z) m an echo spreads at any of the depths."""
+        """Return how far (x, y, z) m an echo spreads at any of the depths."""
         lateral, elevational = np.max([self.compute_widths(float(d)) for d in depth], axis=0)
         scale = _REACH * _SIGMA_PER_WIDTH
         return scale * float(lateral), scale * float(elevational), scale * self.axial
@@ -64,7 +64,7 @@ def compute_envelope(
     point_spread: PointSpread,
     random: np.random.Generator,
 ) -> NDArray[np.float32]:
-    """The envelope (i, j, k) of the echoes, seen by a beam along the last axis.
+    """Return the envelope (i, j, k) of the echoes, seen by a beam along the last axis.
 
     Args:
         diffuse: (i, j, k) root mean square echo of the unresolved scatterers.
@@ -91,7 +91,7 @@ def compute_envelope(
 
 
 def log_compress(envelope: NDArray[np.float32], dynamic_range: float = 60.0) -> NDArray[np.uint8]:
-    """The envelope as grey values: 255 at 1 or more, 0 at ``dynamic_range`` dB below it or less."""
+    """Return an envelope as grey values: 255 at 1 and above, 0 ``dynamic_range`` dB below it."""
     grey = np.maximum(envelope, np.float32(1e-6))
     np.log10(grey, out=grey)
     grey *= np.float32(20.0 * 255.0 / dynamic_range)
@@ -354,9 +354,8 @@ class UpperArm:
         x, y, z = section.x, section.y, section.depth
         fascia = 7.0e-3 + 0.6e-3 * self._fascia_shape.sample_line(x, y)[:, None]
         # Septa wave along the arm, and from place to place between the muscles they part.
-        wave = self._septum_shape.sample_line(x, y)[:, None] + 0.8 * self._cloud.sample_plane(
-            x, y, z
-        )
+        wave = self._septum_shape.sample_line(x, y)[:, None]
+        wave = wave + 0.8 * self._cloud.sample_plane(x, y, z)
         # The medial septum runs from the fascia beside the nerve down to the humerus.
         left_of_septum = 0.9 * (-9e-3 + 0.42 * (z - 15e-3) + 0.5e-3 * wave - x[:, None])
         under_biceps = z - 21e-3 - 0.15 * x[:, None] - 0.8e-3 * wave
@@ -403,10 +402,8 @@ class UpperArm:
     def _nerve(self, section: ArmSection, distance: NDArray[np.float64]) -> None:
         """Add a nerve: dark fascicles in a bright honeycomb."""
         section.fill_tissue("nerve", distance < 0.0, np.full(distance.shape, _echo(-23.0)))
-        (middle_x, middle_z), (radius_x, radius_z) = (
-            self.nerve.compute_centre(section.y),
-            self.nerve.radii,
-        )
+        middle_x, middle_z = self.nerve.compute_centre(section.y)
+        radius_x, radius_z = self.nerve.radii
         for across, down in self._fascicles:
             squares_x = ((section.x - middle_x - across * radius_x) / 0.50e-3) ** 2
             squares_z = ((section.depth - middle_z - down * radius_z) / 0.42e-3) ** 2
@@ -433,10 +430,10 @@ def _add_side_lobes(section: ArmSection) -> None:
 
 
 def _echo(level: Any) -> Any:
-    """The amplitude of a level in dB below full display."""
+    """Return the amplitude of a level in dB below full display."""
     return 10.0 ** (level / 20.0)
 
 
 def _sheet(distance: NDArray[np.float64], thickness: float) -> NDArray[np.float64]:
-    """The profile of a thin surface, 1 at distance 0; thickness is a standard deviation, m."""
+    """Return the profile of a thin surface, 1 in its middle; thickness: standard deviation, m."""
     return np.exp(-0.5 * (distance / thickness) ** 2)

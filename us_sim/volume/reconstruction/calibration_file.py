@@ -1,4 +1,4 @@
-"""Where the image lies on the probe, from a file: Plus' configuration, or YAML.
+"""The place of the image on the probe, from a file: Plus' configuration, or YAML.
 
 Plus' XML may hold several transforms (``<Transform From="Image" To="Probe" Matrix=.../>``, mm),
 and the part of an image that is tissue (``<VolumeReconstruction ClipRectangleOrigin=... />``).
@@ -30,12 +30,9 @@ class SweepCalibration:
 
 
 def read_calibration(path: Path, probe: str) -> SweepCalibration:
-    """Read the fixed transforms of a sweep.
+    """Read the fixed transforms of a sweep: a configuration of Plus, or ``image_to_body`` in YAML.
 
-    Args:
-        path: a configuration of Plus (.xml), or a matrix ``image_to_body`` (.yaml).
-        probe: the frame of the tracked body that the image lies on, for the latter, which does
-            not say its name.
+    YAML does not name the frame of the tracked body that the image lies on: it is ``probe``.
 
     Raises:
         VolumeError: the file cannot be read, or holds no calibration.
@@ -80,7 +77,7 @@ def _read_plus_configuration(path: Path) -> SweepCalibration:
 
 
 def _part(path: Path, element: ElementTree.Element | None) -> ImagePart:
-    """The clip rectangle and the fan of a ``<VolumeReconstruction>``."""
+    """Return the clip rectangle and the fan of a ``<VolumeReconstruction>``."""
     if element is None:
         return ImagePart()
     given: dict[str, Any] = {}

@@ -27,11 +27,7 @@ class Grid:
 
 
 def fit_grid(points: NDArray[np.float64], spacing: float) -> Grid:
-    """Return the grid whose first and last voxels hold the outermost points.
-
-    Args:
-        points: (N, 3) m.
-        spacing: m, of the voxels.
+    """Return the grid, ``spacing`` m fine, whose outer voxels hold the outermost points (N, 3) m.
 
     Raises:
         VolumeError: it would have more voxels than are read from a file, or just one layer of them.

@@ -61,11 +61,7 @@ def plan_insertion(
 ) -> InsertionPlan:
     """Find the grid around a sweep's images, and which of their pixels are used.
 
-    Args:
-        sweep: with poses.
-        compounding: how; its spacing may be proposed.
-        part: of each image; all without it.
-        rest: undoes the deformation of a frame.
+    Without a ``part`` of each image all of it is used; ``rest`` undoes the deformation of a frame.
 
     Raises:
         VolumeError: the matrices are not an image's, no pixel is used, or the grid would be too
@@ -93,10 +89,6 @@ def plan_insertion(
 def reconstruct(planned: InsertionPlan, progress: Progress | None = None) -> Reconstruction:
     """Make the volume of a sweep's images.
 
-    Args:
-        planned: the sweep and its grid.
-        progress: is told how far it is.
-
     Raises:
         VolumeError: the images are damaged, the free memory does not hold the volume, or nothing
             of them lies in the grid.
@@ -104,8 +96,7 @@ def reconstruct(planned: InsertionPlan, progress: Progress | None = None) -> Rec
     sweep, shape = planned.sweep, planned.grid.shape
     frames = len(sweep.numbers)
     tell = progress or (lambda *_: None)
-    shown = " × ".join(map(str, shape))
-    voxels = f"a volume of {shown} voxels"
+    voxels = f"a volume of {' × '.join(map(str, shape))} voxels"
     check_memory(10 * math.prod(shape), voxels, "give a larger --spacing")
     total, count = np.zeros(shape, np.uint32), np.zeros(shape, np.uint32)
     rows, columns = np.nonzero(planned.used)

@@ -19,10 +19,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import theilslopes
 
 from us_sim.errors import UsSimError
-from us_sim.geometry.pose import Placement
+from us_sim.geometry.pose import Placement, Pose
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.choice import ChosenOption
 from us_sim.settings.registry import PROBES
+from us_sim.volume.cases.proposal import round_pose
 from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.sweep import TrackedSweep
 
@@ -76,12 +77,8 @@ def find_scanning_probe(
 
     It is the fan that the part names, or the shape that fits the images, or a linear array as wide
     as the rectangle that the part names. Where there is none of these, the middle of the images'
-    top is taken for the middle of its face.
-
-    Args:
-        sweep: with poses.
-        part: of the images.
-        used: (rows, columns) the pixels of that part.
+    top is taken for the middle of its face. The pixels of the part are those ``used`` (rows,
+    columns).
 
     Raises:
         VolumeError: the images are damaged.
@@ -103,10 +100,8 @@ def fit_part(
 ) -> Fan | Rectangle | None:
     """Fit the fan or the rectangle that was scanned; None where neither fits.
 
-    Args:
-        seen: (rows, columns) pixels that are not black.
-        pixel: (2,) m, from one column to the next, and from one row to the next.
-        used: pixels that count; edges on their border are not the probe's where they cut a fan.
+    Pixels ``seen`` (rows, columns) are not black; ``pixel`` is m from column to column and from row
+    to row. Of pixels ``used``, all without it, edges on their border may cut a fan.
     """
     within = np.ones_like(seen) if used is None else used
     body = _body(seen & within)
@@ -256,9 +251,7 @@ def _poses(
         x = across - (across @ z) * z
         x /= np.linalg.norm(x)
         turned = Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z])).as_quat()
-        a, b, c = (round(float(value), 5) for value in matrix[:3] @ [*(face / pixel), 0.0, 1.0])
-        i, j, k, w = (round(float(value), 6) for value in turned)
-        poses.append(Placement((a, b, c), (i, j, k, w)))
+        poses.append(round_pose(Pose(matrix[:3] @ [*(face / pixel), 0.0, 1.0], turned)))
     return tuple(poses)
 
 

@@ -13,7 +13,7 @@ _PIXEL = Quantity("image distance", -1e5, 1e5)
 
 @dataclass(frozen=True)
 class Compounding(Settings):
-    """How the pixels of many images become voxels."""
+    """The way in which the pixels of many images become voxels."""
 
     error = VolumeError
 

@@ -82,7 +82,7 @@ class SegmentationSettings(Settings):
 
 
 def read_seeds(path: Path) -> SegmentationSettings:
-    """A file of seeds.
+    """Read a file of seeds.
 
     Raises:
         VolumeError: it cannot be read, or a key or value will not do.
@@ -123,7 +123,7 @@ class SegmentRequest(Settings):
         self.given_names()
 
     def given_names(self) -> dict[int, str]:
-        """The names of labels that the person gives.
+        """Return the names of labels that the person gives.
 
         Raises:
             VolumeError: one is not written NUMBER=NAME, is given twice, or is no name.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import SimpleITK as sitk
+import SimpleITK
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -69,7 +69,9 @@ def _found(volume: Volume, asked: StructureSeeds) -> tuple[NDArray[np.bool_], tu
                 f"seed {number} has the grey value {value:.0f}, outside {asked.lower:g} to "
                 f"{asked.upper:g}, so nothing grows from it: move it, or widen the range"
             )
-    found = sitk.ConnectedThreshold(_image(grey, spacing), seeds.tolist(), asked.lower, asked.upper)
+    found = SimpleITK.ConnectedThreshold(
+        _image(grey, spacing), seeds.tolist(), asked.lower, asked.upper
+    )
     if asked.reach is not None:
         near = np.ones(grey.shape, np.uint8)
         near[tuple(seeds.T)] = 0
@@ -77,9 +79,11 @@ def _found(volume: Volume, asked: StructureSeeds) -> tuple[NDArray[np.bool_], tu
         found &= _image((distance <= asked.reach).astype(np.uint8), spacing)
     # The radius of a ball along each axis, in voxels.
     opening, closing = (np.rint(r / spacing).astype(int) for r in (asked.open, asked.close))
-    found = sitk.BinaryMorphologicalOpening(found, opening.tolist(), sitk.sitkBall)
-    found = sitk.BinaryMorphologicalClosing(found, closing.tolist(), sitk.sitkBall)
-    mask = sitk.GetArrayFromImage(sitk.BinaryFillhole(found)).transpose(2, 1, 0).astype(bool)
+    found = SimpleITK.BinaryMorphologicalOpening(found, opening.tolist(), SimpleITK.sitkBall)
+    found = SimpleITK.BinaryMorphologicalClosing(found, closing.tolist(), SimpleITK.sitkBall)
+    mask = (
+        SimpleITK.GetArrayFromImage(SimpleITK.BinaryFillhole(found)).transpose(2, 1, 0).astype(bool)
+    )
     parts, _ = ndimage.label(mask, np.ones((3, 3, 3)))
     mask = np.isin(parts, np.setdiff1d(parts[tuple(seeds.T)], 0))
     if not mask.any():
@@ -87,19 +91,15 @@ def _found(volume: Volume, asked: StructureSeeds) -> tuple[NDArray[np.bool_], tu
     return mask, box
 
 
-def _image(array: NDArray[np.generic], spacing: NDArray[np.float64]) -> sitk.Image:
+def _image(array: NDArray[np.generic], spacing: NDArray[np.float64]) -> SimpleITK.Image:
     """Make an image of an array (i, j, k) with that spacing (3,) in m; an image's is in mm."""
-    image = sitk.GetImageFromArray(np.ascontiguousarray(array.transpose(2, 1, 0)))
+    image = SimpleITK.GetImageFromArray(np.ascontiguousarray(array.transpose(2, 1, 0)))
     image.SetSpacing((spacing * 1e3).tolist())
     return image
 
 
 def _seeds(volume: Volume, asked: StructureSeeds) -> NDArray[np.int64]:
-    """Find the voxels (N, 3) that a structure's seeds lie in.
-
-    Raises:
-        VolumeError: one is outside the volume.
-    """
+    """Find the voxels (N, 3) that a structure's seeds lie in; refuse seeds outside the volume."""
     matrix = volume.patient_to_index
     points = 1e-3 * np.array(asked.seeds_mm)
     seeds = np.floor(points @ matrix[:3, :3].T + matrix[:3, 3] + 0.5).astype(np.int64)

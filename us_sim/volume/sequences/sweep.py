@@ -54,12 +54,9 @@ def read_sweep(
     Frames whose transform or time stamp is missing, not finite or singular, or whose status is
     not OK, are left out and counted.
 
-    Args:
-        path: of the sequence.
-        image: the frame of the images' pixels.
-        reference: the frame in which they are placed.
-        calibration: transforms (4, 4), m (pixels of images), that hold for every frame, by name;
-            they go before those of the sequence that have the same name.
+    The frame ``image`` is that of pixels, which are placed in the frame ``reference``. Transforms
+    (4, 4), m (pixels of images), of a ``calibration`` hold for every frame, by name; they go before
+    those of the sequence that have the same name.
 
     Raises:
         VolumeError: the file or its images cannot be read, no chain leads from one frame to the

@@ -18,7 +18,7 @@ _LARGEST = 1e7  # mm, of any transform's numbers, so that products of them stay 
 
 
 def split_transform_name(name: str) -> tuple[str, str] | None:
-    """The frames that a transform leads from and to; None for a name of no transform.
+    """Return the frames that a transform leads from and to; None for a name of no transform.
 
     Plus (IGSIO, igsioTransformName::SetTransformName) splits a name at the one ``To`` whose next
     character is no lower-case letter, so that a body may be called ``Tool`` or ``Torso``. Frames
@@ -35,7 +35,7 @@ def split_transform_name(name: str) -> tuple[str, str] | None:
 
 
 def is_image_frame(frame: str) -> bool:
-    """Whether a frame is an image's, whose coordinates are pixels and not millimetres."""
+    """Tell whether a frame is an image's, whose coordinates are pixels and not millimetres."""
     return frame.startswith("Image") or frame.endswith("Image")
 
 
@@ -48,7 +48,7 @@ class TransformChain:
 
 
 def find_shortest_chain(names: Iterable[str], start: str, goal: str) -> TransformChain | None:
-    """The chain of the fewest transforms from one frame to another; None where there is none."""
+    """Find the fewest transforms that lead from one frame to another; None where none do."""
     steps: dict[str, list[tuple[str, str, bool]]] = {}  # from a frame: where to, by what, forwards
     for name in names:
         if ends := split_transform_name(name):
@@ -74,12 +74,12 @@ class FrameTransforms:
 
     @cached_property
     def valid(self) -> NDArray[np.bool_]:
-        """(K,) whether the frame's transform can be used."""
+        """(K,) true where the frame's transform can be used."""
         return np.array([not fault for fault in self.faults], dtype=bool)
 
 
 def split_frame_fields(header: Mapping[str, str]) -> dict[int, dict[str, str]]:
-    """The fields of each frame by its number, their names without ``Seq_Frame0000_``."""
+    """Return the fields of each frame by its number, their names without ``Seq_Frame0000_``."""
     frames: dict[int, dict[str, str]] = {}
     for key, value in header.items():
         if match := FRAME_KEY.fullmatch(key):
@@ -88,7 +88,7 @@ def split_frame_fields(header: Mapping[str, str]) -> dict[int, dict[str, str]]:
 
 
 def parse_frame_matrix(fields: Mapping[str, str], key: str) -> NDArray[np.float64]:
-    """A frame's transform (4, 4) as the format holds it: to millimetres, and maybe scaled.
+    """Parse a frame's transform (4, 4), which the format holds in mm, and maybe scaled.
 
     Raises:
         ValueError: with the reason why it cannot be used: its status is not OK, it is missing, is
@@ -112,7 +112,7 @@ def parse_frame_matrix(fields: Mapping[str, str], key: str) -> NDArray[np.float6
 
 
 def parse_frame_time(fields: Mapping[str, str]) -> float:
-    """When the frame was recorded, s of the recorder's clock; nan where it does not say it."""
+    """Return the time of a frame, s of the recorder's clock; nan where it does not say it."""
     try:
         time = float(fields["Timestamp"])
     except (KeyError, ValueError):
@@ -145,7 +145,7 @@ def _over_frames(frames: Sequence[Mapping[str, str]], name: str) -> FrameTransfo
 
 
 def to_metres(name: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A transform of that name, or (K, 4, 4) of them, from millimetres to metres.
+    """Turn a transform of that name, or (K, 4, 4) of them, from millimetres to metres.
 
     Coordinates of images stay pixels.
     """
@@ -161,7 +161,7 @@ def to_metres(name: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 def multiply_chain(
     transforms: Mapping[str, FrameTransforms], chain: TransformChain
 ) -> FrameTransforms:
-    """The product of a chain's transforms, valid where all of them are."""
+    """Return the product of a chain's transforms, valid where all of them are."""
     first = transforms[chain.steps[0][0]]
     matrices, faults = np.broadcast_to(np.eye(4), first.matrices.shape), [""] * len(first.faults)
     for name, forward in chain.steps:

@@ -102,12 +102,8 @@ def write_stl(path: Path, vertices: NDArray[np.float64], triangles: NDArray[np.i
     """Write a surface to a binary file in millimetres; one of that name is replaced.
 
     Its header says that the axes are left, posterior and superior (``SPACE=LPS``), which 3D Slicer
-    looks for; meshio writes no such header.
-
-    Args:
-        path: of the file.
-        vertices: (V, 3) m.
-        triangles: (T, 3), counter-clockwise seen from outside.
+    looks for; meshio writes no such header. Vertices are (V, 3) m, and triangles (T, 3) are
+    counter-clockwise seen from outside.
 
     Raises:
         VolumeError: the file cannot be written.

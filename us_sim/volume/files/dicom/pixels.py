@@ -163,11 +163,9 @@ class GreyImages:
     def read_images(
         self, which: Sequence[tuple[int, int]] | None = None, keep: NDArray[np.bool_] | None = None
     ) -> Iterator[NDArray[np.uint8]]:
-        """Yield images (rows, columns), in the order in which they are asked for.
+        """Yield images (rows, columns) in the order in which they are asked for, or all.
 
-        Args:
-            which: of which file, and which of its images; all without it.
-            keep: (rows, columns) the pixels of each that are kept; the rest becomes 0.
+        Pixels (rows, columns) of each that are not to be kept become 0.
         """
         which = self.all if which is None else which
         levels = GreyLevels()
@@ -184,7 +182,7 @@ class GreyImages:
 
     @cached_property
     def _plain(self) -> bool:
-        """Whether the stored numbers are grey values already."""
+        """True where the stored numbers are grey values already."""
         is_scaled = any(scale != (1.0, 0.0) for scales in self._scales for scale in scales)
         is_byte = self.form.bits == 8 and not self.form.is_signed
         return self._is_palette or (is_byte and not is_scaled)
