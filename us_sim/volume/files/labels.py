@@ -245,17 +245,11 @@ def resample_labels(
     shape: tuple[int, int, int],
     wanted: NDArray[np.float64],
 ) -> tuple[NDArray[np.uint8], list[str]]:
-    """Put labels on a grid of that shape, and remark on it for a person.
+    """Put labels of a file on a grid of that shape, and remark on it for a person.
 
     A file may hold only the part of a volume that is labelled, or its axes in another order or
     direction; its voxels are then those of the volume. Of other grids the nearest voxel is taken.
-
-    Args:
-        path: which errors name.
-        labels: (i, j, k) of the file.
-        placement: (4, 4) m, from the file's indices.
-        shape: of the grid that they shall be on.
-        wanted: (4, 4) m, from its indices.
+    Both places are (4, 4) m, from the indices of the file and of the grid that is ``wanted``.
     """
     to_grid = np.linalg.inv(wanted) @ placement
     whole = np.rint(to_grid)

@@ -130,8 +130,8 @@ def _write_image(
 
             affine = np.diag([-1.0, -1.0, 1.0, 1.0]) @ matrix
             affine[3] = (0.0, 0.0, 0.0, 1.0)
-            pair: Any = nibabel
-            nifti = pair.Nifti1Image(voxels, affine)
+            untyped: Any = nibabel  # whose types leave this class out
+            nifti = untyped.Nifti1Image(voxels, affine)
             nifti.header.set_xyzt_units("mm")
             nifti.to_filename(partial)
         else:

@@ -1,4 +1,4 @@
-"""Which images of DICOM files make a volume, in which order, and where and when they are.
+"""The images of DICOM files that make a volume, their order, and their places and times.
 
 DICOM says of every image where its first pixel is, which way its rows and columns go, and how far
 apart pixels are (PS3.3, C.7.6.2). A volume is a set of such images at even distances along their
