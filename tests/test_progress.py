@@ -47,7 +47,7 @@ def test_a_sentence_begins_on_a_line_of_its_own_below_a_bar_that_was_broken_off(
         raise UsSimError("there is no such thing")
 
     parser = SimpleNamespace(parse_args=lambda _: SimpleNamespace(command=fails))
-    monkeypatch.setattr(main, "_parser", lambda: parser)
+    monkeypatch.setattr(main, "_make_parser", lambda: parser)
     assert main.main([]) == 1
     drawn = capsys.readouterr().err
     assert "solving:  25 %" in drawn
