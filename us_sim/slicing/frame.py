@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,6 @@ from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import Probe
 
 if TYPE_CHECKING:
-    from us_sim.slicing.acoustics.beam_acoustics import BeamAcoustics
     from us_sim.slicing.cutting.slicer import Slicer
     from us_sim.slicing.formation.coupling import ContactSurface
     from us_sim.slicing.formation.image_formation import ImageFormation
@@ -30,6 +29,13 @@ if TYPE_CHECKING:
 
 Contact = tuple[NDArray[np.float32], NDArray[np.float64]]
 Mesh = tuple[NDArray[np.float64], NDArray[np.int32]]
+
+
+class Sound(Protocol):
+    """The way of beams through tissue, such as `BeamAcoustics`."""
+
+    def apply_acoustics(self, image: NDArray[np.uint8], frame: Frame) -> NDArray[np.uint8]:
+        """Return the image as its beams bring it."""
 
 
 @dataclass(eq=False)
@@ -50,7 +56,7 @@ class Frame:
     volume: Volume  # in frame ``patient``
     slicer: Slicer | None = None  # of the mesh; needed where there are nodes
     formation: ImageFormation | None = None  # None shows the slice as it is
-    acoustics: BeamAcoustics | None = None  # None for no more than the volume holds
+    acoustics: Sound | None = None  # None for no more than the volume holds
     surface: ContactSurface | None = None  # of tissue or volume, that the face can touch
     skin_surface: ContactSurface | None = None
     skin: NDArray[np.float64] | None = None  # (V, 3) m, the skin's vertices; None if not known

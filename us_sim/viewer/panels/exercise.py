@@ -197,7 +197,7 @@ class ExercisePanel:
             for answer in (NO_THROMBUS, *points) if is_last else ANSWERS:
                 label = f"at {answer}" if answer.isdigit() else answer
                 button = ui.button(label).props("dense no-caps size=sm")
-                button.props("unelevated" if answer == given else "outline")
+                button.props["outline"] = answer != given
                 button.props["aria-pressed"] = str(answer == given).lower()
                 button.on_click(lambda answer=answer: self._answer(number, answer, is_last))
                 button.props["aria-label"] = f"{what}: {label}"
