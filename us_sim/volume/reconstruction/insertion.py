@@ -81,49 +81,43 @@ def fill_holes(grey: NDArray[np.uint8], covered: NDArray[np.bool_], radius: floa
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill(grey, covered, wanted, directions, steps):
+def _fill(grey, covered, wanted, directions, steps):  # noqa: C901 - one loop of a kernel
     """Fill those wanted (i, j, k) that lie between covered voxels, and unmark the others.
 
     directions: (13, 3). steps: (13,) by which both sides may be apart.
     """
     square = (directions**2).sum(axis=1)
-    for i, j, k in np.ndindex(wanted.shape):
-        if wanted[i, j, k]:
-            value = _between_nearest(grey, covered, (i, j, k), directions, square, steps)
-            wanted[i, j, k] = value >= 0.0
-            if value >= 0.0:
-                grey[i, j, k] = np.uint8(value + 0.5)
+    for i in range(grey.shape[0]):
+        for j in range(grey.shape[1]):
+            for k in range(grey.shape[2]):
+                if not wanted[i, j, k]:
+                    continue
+                shortest, total, count = np.int64(1 << 60), 0.0, 0
+                for d in range(directions.shape[0]):
+                    if 4 * square[d] > shortest:
+                        break  # no pair along this or a later direction is nearer
+                    a, b, c = directions[d]
+                    ahead = _distance(covered, i, j, k, a, b, c, steps[d] - 1)
+                    if ahead == 0:
+                        continue
+                    behind = _distance(covered, i, j, k, -a, -b, -c, steps[d] - ahead)
+                    length = (ahead + behind) ** 2 * square[d]
+                    if behind == 0 or length > shortest:
+                        continue
+                    if length < shortest:
+                        shortest, total, count = length, 0.0, 0
+                    first = np.float64(grey[i + ahead * a, j + ahead * b, k + ahead * c])
+                    second = np.float64(grey[i - behind * a, j - behind * b, k - behind * c])
+                    total += (first * behind + second * ahead) / (ahead + behind)
+                    count += 1
+                if count:
+                    grey[i, j, k] = np.uint8(total / count + 0.5)
+                wanted[i, j, k] = count > 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _between_nearest(grey, covered, voxel, directions, square, steps):
-    """Return the mean value between the nearest pairs around a voxel; -1 where there is no pair."""
-    i, j, k = voxel
-    shortest, total, count = np.int64(1 << 60), 0.0, 0
-    for d in range(directions.shape[0]):
-        if 4 * square[d] > shortest:
-            break  # no pair along this or a later direction is nearer
-        a, b, c = directions[d]
-        ahead = _distance(covered, voxel, (a, b, c), steps[d] - 1)
-        if ahead == 0:
-            continue
-        behind = _distance(covered, voxel, (-a, -b, -c), steps[d] - ahead)
-        length = (ahead + behind) ** 2 * square[d]
-        if behind == 0 or length > shortest:
-            continue
-        if length < shortest:
-            shortest, total, count = length, 0.0, 0
-        first = np.float64(grey[i + ahead * a, j + ahead * b, k + ahead * c])
-        second = np.float64(grey[i - behind * a, j - behind * b, k - behind * c])
-        total += (first * behind + second * ahead) / (ahead + behind)
-        count += 1
-    return total / count if count else -1.0
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _distance(covered, voxel, direction, most):
-    """Count steps from a voxel along a direction to a covered one; 0 where none is near enough."""
-    (i, j, k), (a, b, c) = voxel, direction
+def _distance(covered, i, j, k, a, b, c, most):
+    """Count steps (a, b, c) from a voxel to a covered one; 0 where none is near enough."""
     for step in range(1, most + 1):
         i, j, k = i + a, j + b, k + c
         if not (
