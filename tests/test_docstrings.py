@@ -16,7 +16,7 @@ MODULES = sorted(
     for file in ROOT.rglob("*.py")
     if file.relative_to(ROOT).parts[0] != "nodes" and ">>> " in file.read_text(encoding="utf-8")
 )
-PAGE = ROOT.parent / "docs" / "api.md"
+PAGE = Path(__file__).parents[1] / "docs" / "api.md"
 PUBLIC = re.findall(r"^::: (\S+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
 
 
