@@ -79,7 +79,7 @@ class Attempt(ABC):
 
     @property
     def was_in_air(self) -> bool:
-        """Whether the attempt has begun, or does so once the hand moves the probe."""
+        """True once the attempt has begun, or begins with the next motion of the probe."""
         return self._has_begun or self._air is not None
 
     def add_scan(self, scan: Scan) -> Scan | None:
