@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-# The outward faces of a positively oriented tetrahedron; face f is opposite to corner f. Kernels
-# compile them in.
+# The outward faces of a positively oriented tetrahedron; face f is opposite to corner f. Some
+# kernels compile them in.
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
 MOST_NODES = 2**21  # Most nodes of a mesh, so that the three of a face fit into one 64-bit number
 
