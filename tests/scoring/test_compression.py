@@ -314,3 +314,30 @@ def test_where_all_is_said_at_once_nothing_is_asked():
         attempt(scanned(examination())).set_answers(("compressible",), "", 0.0)
     with pytest.raises(ScoreError, match="compression"):
         replace(read_exercise("keep_force"), feedback="afterwards")
+
+
+def strayed(across=0.0, turn=0.0):
+    """An examination whose probe strays with the force: m, and rad, at 9 N."""
+    seen = scanned(examination())
+    part = seen.force.interpolate_at(seen.motion.times) / 9.0
+    positions = seen.motion.positions + np.outer(across * part, [1.0, 0.0, 0.0])
+    half = 0.5 * turn * part
+    orientations = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
+    return replace(seen, motion=Motion(seen.motion.times, positions, orientations))
+
+
+@pytest.mark.parametrize(
+    ("stray", "word"), [({"across": 0.012}, "slid"), ({"turn": np.deg2rad(60)}, "turned")]
+)
+def test_a_press_that_slides_across_or_turns_does_not_count(stray, word):
+    made = attempt(strayed(**stray))
+    assert [step.is_done for step in made.list_steps()] == [False] * 3
+    assert [fault.what.split()[0] for fault in made.faults] == [word] * 3
+    assert done(strayed(across=0.004, turn=np.deg2rad(15))) == [True] * 3
+
+
+def test_a_light_look_is_acknowledged():
+    at = POINTS[0]
+    looked = [(0, at, 0.0), (1, at, 0.0), (1, at, 0.5), (1, at, 0.5)]
+    assert attempt(scanned(looked)).list_steps()[0].seen == "seen open: press"
+    assert attempt(scanned([*looked[:2], (0.2, at, 0.5)])).list_steps()[0].seen == "not reached"

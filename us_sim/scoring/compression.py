@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import ScoreError
+from us_sim.geometry.pose import Pose
 from us_sim.scoring.centre_line import CentreLine
 from us_sim.scoring.exercise import Attempt, Fault, Step, Task
 from us_sim.scoring.metrics import Scan
@@ -291,11 +292,8 @@ class _Examination(Attempt):
         seconds = self.compute_duration() or 0.0
         is_kept, is_over = seconds <= limit, self.ended is not None
         is_missed = is_over and not is_kept
-        return [
-            Step(
-                f"within {limit:g} s", is_over and is_kept, f"{seconds:.0f} s", is_missed=is_missed
-            )
-        ]
+        is_done, seen = is_over and is_kept, f"{seconds:.0f} s"
+        return [Step(f"within {limit:g} s", is_done, seen, is_missed=is_missed)]
 
     def _look(self, look: _Look) -> None:
         task = self._task
@@ -344,17 +342,16 @@ class _Examination(Attempt):
     def _check_place(self, look: _Look, press: _Press) -> None:
         """Void a press that slides over the skin or turns."""
         begin = press.begin
-        moved = _to_axes(look.place - begin.place, begin.orientation)
+        at_begin = Pose(begin.place, begin.orientation)
+        moved = at_begin.inverse().transform_points(look.place[None])[0]
         slid = float(np.hypot(moved[0], moved[1]))
         turned = 2.0 * np.arccos(min(abs(float(look.orientation @ begin.orientation)), 1.0))
         if press.has_slid or not look.is_touching or (slid <= _TOLERANCE and turned <= _TURN):
             return
         press.has_slid = True
-        how = (
-            f"slid {_MM * slid:.0f} mm"
-            if slid > _TOLERANCE
-            else f"turned {np.rad2deg(turned):.0f}°"
-        )
+        how = f"turned {np.rad2deg(turned):.0f}°"
+        if slid > _TOLERANCE:
+            how = f"slid {_MM * slid:.0f} mm"
         press.problem = f"{how} under pressure: let go before you move on"
         self.faults.append(Fault(look.time, press.problem))
 
@@ -426,13 +423,6 @@ class _Examination(Attempt):
             return f"closed{_format_force(press.closed[0])}: let go"
         seen = f"{100 * press.least:.0f} % open{_format_force(press.force)}"
         return f"{seen}: {'press harder' if press.most < _ENOUGH else 'let go'}"
-
-
-def _to_axes(vector: NDArray[np.float64], orientation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a vector (3,) of frame ``patient`` along the axes of a probe."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_quat(orientation).inv().apply(vector))
 
 
 def _format_force(force: float) -> str:

@@ -65,13 +65,13 @@ class Attempt(ABC):
     """
 
     is_blind = False
-    """Whether steps say nothing that an image does not show, until the attempt has ended."""
+    """True if steps say only what an image shows, until the attempt has ended."""
     touched: float | None = None
     """s since the first pose, when the probe touched the skin for the first time."""
     ended: float | None = None
     """s, when all was done or the time was over; None before."""
     faults: Sequence[Fault] = ()
-    """What was done wrong, in order."""
+    """Everything that was done wrong, in order."""
     _has_begun = False
     _air: tuple[float, NDArray[np.float64]] | None = None
     """s and (3,) m: since when, and from where, the probe is in the air."""

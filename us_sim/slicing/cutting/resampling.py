@@ -1,4 +1,4 @@
-"""Where the pixels of an image lie at rest, and the volume's values there.
+"""Places of an image's pixels at rest, and the volume's values there.
 
 >>> import numpy as np
 >>> from us_sim.slicing.cutting.resampling import LocatedPixels
