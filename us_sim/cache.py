@@ -2,17 +2,6 @@
 
 An entry is a folder of .npy files and a description. It is renamed to its place when it is whole.
 A lock lets one process make it while others wait. What cannot be read is made again.
-
->>> import os, tempfile
->>> import numpy as np
->>> from us_sim.cache import load_or_create
->>> form = lambda x: ({"x": x}, {}), lambda arrays, facts: arrays["x"]
->>> with tempfile.TemporaryDirectory() as os.environ["US_SIM_CACHE"]:
-...     made = load_or_create("square", *form, lambda: np.eye(2))
-...     again = load_or_create("square", *form, lambda: 1 / 0)
-...     bool((made == again).all())
-True
->>> del os.environ["US_SIM_CACHE"]
 """
 
 from __future__ import annotations
@@ -58,44 +47,37 @@ def load_or_create(
         make: makes the thing; called by one process at a time.
     """
     entry, made = cache_folder() / key, None
-    found = _load(entry, unpack)
-    if found is not None:
+    if (found := _load(entry, unpack)) is not None:
         return found
     try:
         entry.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(entry.with_name(f"{key}.lock")):
-            found = _load(entry, unpack, warn=True)
-            if found is None:
+            if (found := _load(entry, unpack)) is None:
                 made = make()
                 _store(entry, *pack(made))
                 found = _load(entry, unpack)  # mapped: of no use is the copy in memory
     except OSError as error:
         _logger.warning("%s cannot be written (%s), so it is not kept", entry, error)
-    if found is not None:
-        return found
-    return make() if made is None else made
+    if found is None:
+        return make() if made is None else made
+    return found
 
 
-def _load(
-    entry: Path, unpack: Callable[[Arrays, Facts], Thing], *, warn: bool = False
-) -> Thing | None:
+def _load(entry: Path, unpack: Callable[[Arrays, Facts], Thing]) -> Thing | None:
     """Load the entry's thing; None where it is absent or damaged."""
-    if not entry.exists():
-        return None
     try:
         facts = json.loads((entry / "facts.json").read_text(encoding="utf-8"))
         # Plain arrays over the maps: a subclass would slow and surprise callers.
-        files = entry.glob("*.npy")
-        arrays = {file.stem: np.asarray(np.load(file, mmap_mode="r")) for file in files}
+        arrays = {f.stem: np.asarray(np.load(f, mmap_mode="r")) for f in entry.glob("*.npy")}
         return unpack(arrays, facts)
-    except Exception as error:  # whatever a damaged entry leads to
-        if warn:
-            _logger.warning("%s is damaged (%s), so it is made again", entry, error)
+    except Exception:  # whatever a damaged entry leads to
         return None
 
 
 def _store(entry: Path, arrays: Arrays, facts: Facts) -> None:
     """Write an entry; the caller holds its lock."""
+    if entry.exists():
+        _logger.warning("%s is damaged, so it is made again", entry)
     partial = entry.with_name(f"{entry.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)  # of a process that was killed
     try:

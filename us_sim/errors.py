@@ -2,13 +2,7 @@
 
 
 def printable_line(text: str, longest: int = 2000) -> str:
-    r"""Return the text on one line without control characters; a long one loses its middle.
-
-    The end stays, since it says what is wrong and what to do.
-
-    >>> printable_line("a \x1b[31mname\nof a stranger", 20)
-    'a ?[31mnam … a stranger'
-    """
+    """Return the text on one line without control characters; a long one loses its middle."""
     half = longest // 2
     cut = text if len(text) <= longest else f"{text[:half]} … {text[len(text) - half :]}"
     return "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in cut)
@@ -34,15 +28,7 @@ class SceneError(UsSimError):
 
 
 class MessageError(UsSimError):
-    """A message that came in cannot be read, or is not for where it was sent."""
-
-
-class FrameError(MessageError):
-    """A message is in another coordinate frame than it must be."""
-
-
-class StampError(UsSimError):
-    """A stamp is no time."""
+    """A message cannot be read, or is not for where it came: its frame or stamp is wrong."""
 
 
 class PoseError(UsSimError):
@@ -82,15 +68,11 @@ class TrackingError(UsSimError):
 
 
 class CalibrationError(UsSimError):
-    """Calibration data are wrong, or cannot determine the answer."""
+    """Measurements are wrong, or cannot determine a calibration or a stiffness."""
 
 
 class EpisodeError(UsSimError):
     """An action cannot be done, or an environment or a data set cannot be made as asked."""
-
-
-class StiffnessError(UsSimError):
-    """A recorded press is no press, or cannot determine how stiff tissue is."""
 
 
 class ScoreError(UsSimError):

@@ -3,13 +3,6 @@
 Numba compiles a kernel anew if its file changed, but not if a function that it calls did. So the
 cache's folder is named by a hash of all such sources. It is below `NUMBA_CACHE_DIR`, or `kernels`
 in the folder of `us_sim.cache`.
-
->>> from us_sim.kernels import njit
->>> @njit(nogil=True)  # and cache=True in a module; an example like this has no file
-... def twice(x):
-...     return 2 * x
->>> twice(21)
-42
 """
 
 from __future__ import annotations

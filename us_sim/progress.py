@@ -12,11 +12,9 @@ from us_sim.errors import printable_line
 
 
 class Progress(tqdm):
-    """A bar on stderr from 0 to ``total``; without a total, only the text.
+    """A bar on stderr from 0 to ``total``, drawn once ``delay`` s have passed.
 
-    Where stderr is no terminal it writes a line every few seconds instead.
-
-    Nothing is drawn before ``delay`` s have passed.
+    Without a total it is only the text; where stderr is no terminal, a line every few seconds.
     """
 
     def __init__(
@@ -56,9 +54,3 @@ def late_progress(description: str) -> Callable[[float, str], None]:
             bar = None
 
     return show
-
-
-def end_late_bars() -> None:
-    """End the lines of bars whose work was broken off, so that a sentence begins a new one."""
-    for bar in [*tqdm._instances]:  # type: ignore[attr-defined]
-        bar.close()

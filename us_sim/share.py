@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import os
 from collections.abc import Iterator
@@ -22,13 +23,10 @@ def shared_roots() -> Iterator[Path]:
         yield checkout
     for prefix in filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)):
         yield Path(prefix) / "share" / "us_sim"
-    try:
-        distribution = importlib.metadata.distribution("us_sim")
-    except importlib.metadata.PackageNotFoundError:
-        return
-    for file in distribution.files or []:
-        if file.parts[-3:] == ("share", "us_sim", "package.xml"):
-            yield Path(str(distribution.locate_file(file))).resolve().parent
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        for file in importlib.metadata.files("us_sim") or []:
+            if file.parts[-3:] == ("share", "us_sim", "package.xml"):
+                yield Path(str(file.locate())).resolve().parent
 
 
 def shared_path(relative: str) -> Path:
@@ -46,8 +44,7 @@ def shared_path(relative: str) -> Path:
 def find_bag(name: str | Path) -> Path:
     """Return the path of a bag, or of the installed one of that name."""
     path = Path(os.path.expanduser(name))
-    if not os.path.exists(path) and path.name == str(name):
-        for root in shared_roots():
-            if os.path.exists(root / "bags" / path):
-                return root / "bags" / path
-    return path
+    if os.path.exists(path) or path.name != str(name):
+        return path
+    installed = (root / "bags" / path for root in shared_roots())
+    return next(filter(os.path.exists, installed), path)

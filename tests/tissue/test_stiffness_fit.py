@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tissue_block import block_mesh
 
-from us_sim.errors import StiffnessError
+from us_sim.errors import CalibrationError
 from us_sim.geometry.collider import Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
@@ -83,7 +83,7 @@ def test_what_no_force_tells_is_refused_by_name(press):
 
     errors = np.random.default_rng(2).normal(scale=0.01, size=press.wrenches.shape)
     noisy = replace(press, wrenches=press.wrenches + errors)
-    with pytest.raises(StiffnessError, match="--keep bone"):
+    with pytest.raises(CalibrationError, match="--keep bone"):
         fit_stiffness(MODEL, with_bone, {**TRUE, "bone": 1e5}, noisy, FEW)
 
 
@@ -97,7 +97,7 @@ def test_what_no_force_tells_is_refused_by_name(press):
     ],
 )
 def test_what_is_no_press_of_this_tissue_is_refused(press, change, settings, word):
-    with pytest.raises(StiffnessError, match=word):
+    with pytest.raises(CalibrationError, match=word):
         fit_stiffness(MODEL, constants, START, change(press), settings)
 
 
@@ -112,7 +112,7 @@ def test_poses_get_the_wrench_that_is_nearest_in_time():
         (stamps, np.ones((20, 6)), "never"),
         (stamps, np.full((20, 6), np.nan), "finite"),
     ):
-        with pytest.raises(StiffnessError, match=word):
+        with pytest.raises(CalibrationError, match=word):
             pair_press(stamps, poses, felt_at, felt, FEW)
 
 

@@ -161,7 +161,7 @@ def _report_interruption() -> int:
 
 def _print_error(sentence: str) -> None:
     """Print a sentence to stderr, on a line of its own below the bars of unfinished work."""
-    progress = sys.modules.get("us_sim.progress")  # which costs time to import
-    if progress is not None:
-        progress.end_late_bars()
+    if "tqdm" in sys.modules:  # which costs time to import
+        for bar in [*sys.modules["tqdm"].tqdm._instances]:
+            bar.close()
     print(f"us-sim: {printable_line(sentence)}", file=sys.stderr)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
-from us_sim.errors import StiffnessError
+from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
@@ -43,7 +43,7 @@ _PRESSED = 2e-4  # m, depth from which on a probe presses
 class StiffnessSettings(Settings):
     """Young's moduli from a press: each field is an option of ``us-sim fit-stiffness``."""
 
-    error = StiffnessError
+    error = CalibrationError
 
     keep: tuple[str, ...] = setting(
         description="structures whose modulus stays as the scene says", default=()
@@ -122,12 +122,12 @@ def pair_press(
         settings: the tolerance, and by how much wrenches are late.
 
     Raises:
-        StiffnessError: too few poses have a wrench, one is not finite, or all are the same.
+        CalibrationError: too few poses have a wrench, one is not finite, or all are the same.
     """
     if not np.isfinite(wrenches).all():
-        raise StiffnessError("a wrench is not finite: leave that part of the recording out")
+        raise CalibrationError("a wrench is not finite: leave that part of the recording out")
     if not np.ptp(wrenches, axis=0).any():
-        raise StiffnessError("the wrench never changes: was the sensor read?")
+        raise CalibrationError("the wrench never changes: was the sensor read?")
     order = np.argsort(felt_at, kind="stable")
     wanted = stamps + round(1e9 * settings.time_offset)
     after = np.clip(np.searchsorted(felt_at[order], wanted), 1, len(order) - 1)
@@ -135,7 +135,7 @@ def pair_press(
     nearest = np.where(wanted - felt_at[earlier] < felt_at[later] - wanted, earlier, later)
     near = np.flatnonzero(np.abs(felt_at[nearest] - wanted) <= round(1e9 * settings.tolerance))
     if len(near) < FEWEST:
-        raise StiffnessError(
+        raise CalibrationError(
             f"{len(near)} of {len(stamps)} poses have a wrench within "
             f"{1e3 * settings.tolerance:g} ms, and {FEWEST} are needed: record both with one clock"
         )
@@ -162,12 +162,12 @@ def fit_stiffness(
         progress: called with the fraction done of a press, and the misfit.
 
     Raises:
-        StiffnessError: the press does not determine a modulus, or is not one of this tissue.
+        CalibrationError: the press does not determine a modulus, or is not one of this tissue.
         SolverError: the tissue cannot be solved.
     """
     names = [name for name in moduli if name not in settings.keep]
     if not names or not set(settings.keep) <= set(moduli):
-        raise StiffnessError(f"--keep: name some of {', '.join(moduli)}, and not all")
+        raise CalibrationError(f"--keep: name some of {', '.join(moduli)}, and not all")
     depths = np.array([_depth(model, pose) for pose in press.poses])
     chosen = _choose_poses(depths, settings.poses)
     poses = [press.poses[k] for k in chosen.tolist()]
@@ -181,7 +181,7 @@ def fit_stiffness(
         pressed = replace(model, materials=constants(tried))
         modelled = simulate_wrenches(pressed, press.poses, depths, _titled(progress, state))
         if modelled[:, 2] @ (press.wrenches[:, 2] - press.wrenches[:, 2].mean()) < 0.0:
-            raise StiffnessError(
+            raise CalibrationError(
                 "the wrench points the other way: along z the force on the probe falls below zero "
                 "when it is pressed in; turn the sensor's sign"
             )
@@ -200,13 +200,13 @@ def fit_stiffness(
         name for name, width in zip(names, widths, strict=True) if width > np.log(settings.widest)
     ]
     if wide:
-        raise StiffnessError(
+        raise CalibrationError(
             f"this press does not determine {', '.join(wide)}: press deeper, from other sides or "
             f"nearer to it, or keep the scene's with --keep {' '.join(wide)}"
         )
     ends = [name for name, on in zip(names, found.active_mask, strict=True) if on]
     if ends:
-        raise StiffnessError(
+        raise CalibrationError(
             f"{', '.join(ends)}: runs to {FARTHEST:g} times what the scene says, or that part of "
             f"it: check the registration and the sensor's units, or --keep {' '.join(ends)}"
         )
@@ -236,7 +236,7 @@ def simulate_wrenches(
     ``depths`` (K,) m are those in the tissue at rest.
 
     Raises:
-        StiffnessError: the tissue does not come to balance at a pose.
+        CalibrationError: the tissue does not come to balance at a pose.
     """
     solver, wrenches = FemNonlinear(model), np.zeros((len(poses), 6))
     for k in np.flatnonzero(depths > 0.0).tolist():
@@ -247,7 +247,7 @@ def simulate_wrenches(
             if solver.is_settled:
                 break
         if not deformation.residual <= _BALANCED:
-            raise StiffnessError(
+            raise CalibrationError(
                 f"the tissue does not come to balance {1e3 * depths[k]:.1f} mm deep: is the press "
                 f"deeper than tissue yields, or the mesh too coarse for it?"
             )
@@ -280,11 +280,11 @@ def _choose_poses(depths: NDArray[np.float64], count: int) -> NDArray[np.intp]:
     """Choose poses in the order of time: as many in the tissue as without contact.
 
     Raises:
-        StiffnessError: too few press the tissue.
+        CalibrationError: too few press the tissue.
     """
     pressed, free = np.flatnonzero(depths > _PRESSED), np.flatnonzero(depths < 0.0)
     if len(pressed) < FEWEST:
-        raise StiffnessError(
+        raise CalibrationError(
             f"{len(pressed)} poses press the tissue, and {FEWEST} are needed (the deepest is "
             f"{1e3 * depths.max():.1f} mm, below zero outside): is the recording of this scene, "
             f"and its registration right?"
