@@ -28,7 +28,15 @@ class SceneError(UsSimError):
 
 
 class MessageError(UsSimError):
-    """A message cannot be read, or is not for where it came: its frame or stamp is wrong."""
+    """A message that came in cannot be read, or is not for where it was sent."""
+
+
+class FrameError(MessageError):
+    """A message is in another coordinate frame than it must be."""
+
+
+class StampError(UsSimError):
+    """A stamp is no time."""
 
 
 class PoseError(UsSimError):
@@ -36,11 +44,7 @@ class PoseError(UsSimError):
 
 
 class MeshError(UsSimError):
-    """A mesh cannot carry a deformation."""
-
-
-class MaterialError(UsSimError):
-    """A material is not physical, or a label has none."""
+    """A mesh, or a material of its elements, cannot carry a deformation."""
 
 
 class SolverError(UsSimError):

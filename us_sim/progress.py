@@ -39,10 +39,7 @@ class Progress(tqdm):
 
 
 def late_progress(description: str) -> Callable[[float, str], None]:
-    """Return a function of the fraction done and what is done; it draws a bar after a second.
-
-    At 1 the bar is finished, and the next call begins another.
-    """
+    """Return a function of the fraction done, which ends a bar at 1, and of what is being done."""
     bar: Progress | None = None
 
     def show(fraction: float, text: str) -> None:

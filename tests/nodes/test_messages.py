@@ -14,7 +14,7 @@ from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 from visualization_msgs.msg import Marker, MarkerArray
 
-from us_sim.errors import MeshError, MessageError, PoseError, ProbeError, VolumeError
+from us_sim.errors import MeshError, MessageError, PoseError, ProbeError, StampError, VolumeError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.messages import (
     MarkerShape,
@@ -174,9 +174,9 @@ def test_stamps_round_trip(nanoseconds):
 
 def test_stamps_that_are_no_time_are_refused():
     for stamp in (Time(sec=-1), Time(nanosec=10**9), Time(sec=2**31 - 1, nanosec=2**32 - 1)):
-        with pytest.raises(MessageError, match=f"{stamp.sec} .* {stamp.nanosec} "):
+        with pytest.raises(StampError, match=f"{stamp.sec} .* {stamp.nanosec} "):
             nanoseconds_of(stamp)
-    with pytest.raises(MessageError, match="later"):
+    with pytest.raises(StampError, match="later"):
         stamp_message(2**31 * 10**9)
     assert stamp_message(-5) == Time()
 

@@ -389,7 +389,10 @@ def test_in_lockstep_the_clock_goes_with_the_poses(bench, path):
     for count in range(1, 4):
         bench.spin_until(lambda count=count: len(poses) == count)
         images.publish(image_message(np.zeros((2, 2), np.uint8), poses[-1].header.stamp, "probe"))
-    bench.spin_until(lambda: player.finished.done() and len(ticks) >= 3)
+
+    def times():
+        return {Time.from_msg(tick.clock).nanoseconds - EPOCH for tick in ticks}
+
+    bench.spin_until(lambda: player.finished.done() and len(times()) >= 3)
     assert depths(poses) == [7, 8, 9]
-    times = {Time.from_msg(tick.clock).nanoseconds - EPOCH for tick in ticks}
-    assert times == {7 * STEP, 8 * STEP, 9 * STEP}
+    assert times() == {7 * STEP, 8 * STEP, 9 * STEP}

@@ -13,7 +13,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from numpy.typing import NDArray
 from std_msgs.msg import Bool, Float64MultiArray
 
-from us_sim.errors import MessageError, SceneError, UsSimError
+from us_sim.errors import SceneError, StampError, UsSimError
 from us_sim.nodes.messages import contact_model_from, serialize_wrench
 from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import FOREIGN
@@ -105,7 +105,7 @@ class HapticRenderer(SceneNode):
     def _on_pose(self, message: PoseStamped) -> None:
         pose, stamp = pose_from(message, self._frame), nanoseconds_of(message.header.stamp)
         if stamp == 0:
-            raise MessageError("there is no stamp: let the arm's driver set it")
+            raise StampError("there is no stamp: let the arm's driver set it")
         self._rendering.update_pose(stamp, pose, time.monotonic_ns())
 
     def _on_model(self, message: Float64MultiArray) -> None:

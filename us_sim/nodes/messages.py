@@ -19,7 +19,7 @@ from shape_msgs.msg import Mesh, MeshTriangle
 from std_msgs.msg import Float64MultiArray, Header, Int32MultiArray, MultiArrayDimension
 from visualization_msgs.msg import Marker
 
-from us_sim.errors import MessageError, PoseError, TrackingError
+from us_sim.errors import PoseError, StampError, TrackingError
 from us_sim.geometry.pose import Pose
 from us_sim.recording.decoding import LAST_SECOND, SECOND, to_nanoseconds
 from us_sim.tracking.haptic import ContactModel
@@ -38,11 +38,11 @@ def stamp_message(nanoseconds: int) -> Time:
     """Make the stamp of a time in ns since 1970, at least 0.
 
     Raises:
-        MessageError: the time is too late for a stamp.
+        StampError: the time is too late for a stamp.
     """
     seconds, rest = divmod(max(int(nanoseconds), 0), SECOND)
     if seconds > LAST_SECOND:
-        raise MessageError(f"a time of {seconds} s after 1970 is later than a stamp can say")
+        raise StampError(f"a time of {seconds} s after 1970 is later than a stamp can say")
     return Time(sec=seconds, nanosec=rest)
 
 

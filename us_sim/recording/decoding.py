@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import (
+    FrameError,
     MeshError,
     MessageError,
     PoseError,
     ProbeError,
+    StampError,
     VolumeError,
 )
 from us_sim.geometry.pose import Pose
@@ -34,7 +36,7 @@ def nanoseconds_of(stamp: Any) -> int:
     """Return the ns since 1970 of a stamp; 0 for one that was never set.
 
     Raises:
-        MessageError: it is no time: before 1970, with a second's worth of nanoseconds or more, or
+        StampError: it is no time: before 1970, with a second's worth of nanoseconds or more, or
             so late that ROS cannot count any further.
     """
     return to_nanoseconds(stamp.sec, stamp.nanosec)
@@ -44,10 +46,10 @@ def to_nanoseconds(seconds: int, nanoseconds: int) -> int:
     """Return the ns since 1970 of a stamp's two parts.
 
     Raises:
-        MessageError: it is no time.
+        StampError: it is no time.
     """
     if not 0 <= seconds <= LAST_SECOND or not 0 <= nanoseconds < SECOND:
-        raise MessageError(
+        raise StampError(
             f"the stamp of {seconds} s and {nanoseconds} ns is no time: let the sender stamp its "
             f"messages with its clock"
         )
@@ -81,10 +83,10 @@ def require_frame(header: Any, frame: str | None) -> None:
     """Check the frame of a message; None is any.
 
     Raises:
-        MessageError: it is another one.
+        FrameError: it is another one.
     """
     if frame is not None and header.frame_id != frame:
-        raise MessageError(f"is in frame '{header.frame_id}', not '{frame}'")
+        raise FrameError(f"is in frame '{header.frame_id}', not '{frame}'")
 
 
 _FARTHEST_POSE = 1e7
@@ -96,7 +98,7 @@ def pose_from(message: Any, frame: str | None = None) -> Pose:
 
     Raises:
         PoseError: it is not finite, beyond any place, or its quaternion has no length to speak of.
-        MessageError: it is in another frame.
+        FrameError: it is in another frame.
     """
     require_frame(message.header, frame)
     return _pose(message.pose.position, message.pose.orientation)
@@ -139,7 +141,8 @@ def wrench_from(message: Any, frame: str | None = None) -> NDArray[np.float64]:
     """Return force and torque (6,) N, N m about the origin of the message's frame.
 
     Raises:
-        MessageError: a number is not finite, or it is in another frame.
+        MessageError: a number is not finite.
+        FrameError: it is in another frame.
     """
     require_frame(message.header, frame)
     return _six_numbers("wrench", message.wrench.force, message.wrench.torque)
@@ -181,7 +184,7 @@ def vectors_from(message: Any, frame: str | None = None) -> NDArray[np.float64]:
     Raises:
         MeshError: a field is missing, no float, or outside of its point; the data do not fill the
             stated size; a coordinate is not finite, or too large to be one.
-        MessageError: it is in another frame.
+        FrameError: it is in another frame.
     """
     require_frame(message.header, frame)
     fields = {field.name: field for field in message.fields}
@@ -323,7 +326,7 @@ def triangles_from(message: Any, frame: str) -> list[MarkedTriangles]:
 
     Raises:
         MeshError: corners do not make whole triangles, or one is not finite.
-        MessageError: a marker is in another frame.
+        FrameError: a marker is in another frame.
     """
     corners: dict[str, list[NDArray[np.float64]]] = {}
     colours: dict[str, tuple[float, float, float]] = {}
@@ -346,7 +349,7 @@ def line_from(message: Any, frame: str) -> NDArray[np.float64]:
 
     Raises:
         MeshError: a point is not finite.
-        MessageError: the marker is in another frame.
+        FrameError: the marker is in another frame.
     """
     for marker in message.markers:
         if marker.type == _LINE_STRIP and marker.action == _ADD and marker.points:

@@ -162,7 +162,7 @@ def build_tissue_model(
     Raises:
         SceneError: a label of the volume has no material, or a material, fixed part or structure
             is unknown.
-        MeshError, MaterialError: the mesh or a material cannot be used.
+        MeshError: the mesh or a material cannot be used.
 
     Examples:
         >>> from us_sim.scene.reading import load_scene

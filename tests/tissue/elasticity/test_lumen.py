@@ -9,7 +9,7 @@ from scipy.integrate import quad
 from scipy.optimize import brentq, minimize
 from tissue_block import block, block_mesh
 
-from us_sim.errors import MaterialError, SolverError
+from us_sim.errors import MeshError, SolverError
 from us_sim.geometry.collider import RoundedBox
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
@@ -324,7 +324,7 @@ def test_a_pressed_lumen_in_a_block_empties_and_fills_again():
     ("pressure", "found"), [(-100.0, "-100 Pa"), (np.nan, "nan"), ("8 cmH2O", "8 cmH2O")]
 )
 def test_a_pressure_that_cannot_be_is_refused(pressure, found):
-    with pytest.raises(MaterialError, match=f"material.lumen_pressure: .*{found}"):
+    with pytest.raises(MeshError, match=f"material.lumen_pressure: .*{found}"):
         Material(5e3, 0.1, 1000.0, lumen_pressure=pressure)
     assert Material(5e3, lumen_pressure="1.3 kPa").lumen_pressure == 1300.0
     assert Material(5e3, lumen_pressure="8 mmHg").lumen_pressure == pytest.approx(1066.6, abs=0.1)
@@ -336,7 +336,7 @@ def test_a_pressure_that_cannot_be_is_refused(pressure, found):
 )
 def test_constants_of_a_lumen_that_cannot_be_are_refused(fraction, pressure):
     one = np.ones(2)
-    with pytest.raises(MaterialError, match=r"tetrahedron 1 .*lumen"):
+    with pytest.raises(MeshError, match=r"tetrahedron 1 .*lumen"):
         TissueMaterials(one, 0 * one, one, np.array([0.0, fraction]), np.array([0.0, pressure]))
-    with pytest.raises(MaterialError, match="lumen_fraction"):
+    with pytest.raises(MeshError, match="lumen_fraction"):
         TissueMaterials(one, 0 * one, one, np.ones(3), one)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tissue_block import block_mesh
 
-from us_sim.errors import MaterialError
+from us_sim.errors import MeshError
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import (
     TissueMaterials,
@@ -83,13 +83,13 @@ def test_a_label_without_material_is_named():
     labels = voxels()
     labels[:50] = 8
     fractions = label_fractions(block_mesh((5, 3, 3)), labels, INDEX)
-    with pytest.raises(MaterialError, match="label 8"):
+    with pytest.raises(MeshError, match="label 8"):
         average_over_labels(fractions, {1: FAT})
 
 
 def test_a_mesh_outside_the_volume_is_refused():
     mesh = box_mesh([1.0, 1.1], [0.0, 0.1], [0.0, 0.1])
-    with pytest.raises(MaterialError, match="outside"):
+    with pytest.raises(MeshError, match="outside"):
         label_fractions(mesh, voxels(), INDEX)
 
 
@@ -102,7 +102,7 @@ def test_a_mesh_outside_the_volume_is_refused():
     ],
 )
 def test_labels_and_map_must_be_what_they_say(labels, index):
-    with pytest.raises(MaterialError):
+    with pytest.raises(MeshError):
         label_fractions(block_mesh((2, 2, 2)), labels, index)
 
 
@@ -116,9 +116,9 @@ def test_labels_and_map_must_be_what_they_say(labels, index):
     ],
 )
 def test_unphysical_constants_are_refused(modulus, ratio, density, key):
-    with pytest.raises(MaterialError, match=rf"material\.{key}: "):
+    with pytest.raises(MeshError, match=rf"material\.{key}: "):
         Material(modulus, ratio, density)
-    with pytest.raises(MaterialError, match="tetrahedron 1"):
+    with pytest.raises(MeshError, match="tetrahedron 1"):
         TissueMaterials(
             np.array([1e4, modulus]), np.array([0.4, ratio]), np.array([1000.0, density])
         )

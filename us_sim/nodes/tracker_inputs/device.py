@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import Header
 
-from us_sim.errors import MessageError, UsSimError
+from us_sim.errors import FrameError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.guarded_node import error_kind
 from us_sim.nodes.process import MEASURING
@@ -84,12 +84,13 @@ class TrackerNode(SceneNode):
             frame: that it must be in; empty is the scene's.
 
         Raises:
-            MessageError: it is in another frame, or its stamp is no time.
+            FrameError: it is in another frame.
             PoseError: it is no pose.
+            StampError: its stamp is no time.
         """
         found, frame = message.header.frame_id, frame or self.scene.tracker.frame
         if found != frame:
-            raise MessageError(
+            raise FrameError(
                 f"is in frame '{found}', not '{frame}': set the tracker's frame, or tracker.frame "
                 f"in the scene"
             )

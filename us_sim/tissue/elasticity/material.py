@@ -31,7 +31,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from us_sim.errors import MaterialError
+from us_sim.errors import MeshError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
@@ -51,7 +51,7 @@ class Material(Settings):
     a solid all the same, of the Young's modulus and Poisson's ratio that stand in for it.
 
     Raises:
-        MaterialError: a constant is out of its range.
+        MeshError: a constant is out of its range.
 
     Examples:
         >>> Material(young_modulus=12e3, poisson_ratio=0.49).density
@@ -59,7 +59,7 @@ class Material(Settings):
     """
 
     section = "material"
-    error = MaterialError
+    error = MeshError
     live = True
 
     young_modulus: float = setting(YOUNG_MODULUS, "Young's modulus")

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import MaterialError
+from us_sim.errors import MeshError
 from us_sim.kernels import njit
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
@@ -23,7 +23,7 @@ class TissueMaterials:
     """Constants of each tetrahedron of a mesh.
 
     Raises:
-        MaterialError: different lengths, or a constant that is not physical.
+        MeshError: different lengths, or a constant that is not physical.
     """
 
     young_modulus: NDArray[np.float64]  # (M,), Pa
@@ -42,7 +42,7 @@ class TissueMaterials:
             if name.startswith("lumen") and values.size == 0:
                 values = np.zeros(len(self.young_modulus))
             if values.ndim != 1 or len(values) != len(self.young_modulus):
-                raise MaterialError(f"{name} needs one number for each tetrahedron")
+                raise MeshError(f"{name} needs one number for each tetrahedron")
             object.__setattr__(self, name, values)
         unphysical = {
             "young_modulus": ~(np.isfinite(self.young_modulus) & (self.young_modulus > 0)),
@@ -53,7 +53,7 @@ class TissueMaterials:
             if bad.any():
                 where = int(np.flatnonzero(bad)[0])
                 others = f" and of {bad.sum() - 1} others" if bad.sum() > 1 else ""
-                raise MaterialError(
+                raise MeshError(
                     f"{name} of tetrahedron {where}{others} is out of range, "
                     f"{getattr(self, name)[where]:g}: moduli and densities are above zero, "
                     f"Poisson's ratio is above -1 and below 0.5"
@@ -63,7 +63,7 @@ class TissueMaterials:
         wrong |= ~(np.isfinite(self.lumen_pressure) & ((self.lumen_pressure > 0) == hollow))
         if wrong.any():
             where = int(np.flatnonzero(wrong)[0])
-            raise MaterialError(
+            raise MeshError(
                 f"tetrahedron {where} has a lumen of {self.lumen_fraction[where]:g} of its volume "
                 f"at {self.lumen_pressure[where]:g} Pa: fractions are 0 to 1, and pressures above "
                 f"zero where there is a lumen, and zero elsewhere"
@@ -110,20 +110,20 @@ def label_fractions(
         index_from_patient: (4, 4) affine, patient metres to voxel indices (centres at integers).
 
     Raises:
-        MaterialError: the labels are not a 3-D uint8 array, the map is not affine, or the mesh and
+        MeshError: the labels are not a 3-D uint8 array, the map is not affine, or the mesh and
             the labels do not overlap.
     """
     if labels.ndim != 3 or labels.dtype != np.uint8 or 0 in labels.shape:
-        raise MaterialError(
+        raise MeshError(
             f"labels are {labels.dtype} of shape {labels.shape}: give a 3-D uint8 array"
         )
     affine = np.ascontiguousarray(index_from_patient, dtype=np.float64)
     if affine.shape != (4, 4) or not np.isfinite(affine).all():
-        raise MaterialError("index_from_patient must be a finite 4x4 affine matrix")
+        raise MeshError("index_from_patient must be a finite 4x4 affine matrix")
     indices = mesh.nodes @ affine[:3, :3].T + affine[:3, 3]
     last = np.array(labels.shape) - 0.5
     if (indices.max(axis=0) < -0.5).any() or (indices.min(axis=0) > last).any():
-        raise MaterialError(
+        raise MeshError(
             f"the mesh lies outside the labelled volume: its voxel indices run from "
             f"{indices.min(axis=0).round(1).tolist()} to {indices.max(axis=0).round(1).tolist()}, "
             f"the volume has shape {list(labels.shape)}"
@@ -145,11 +145,11 @@ def average_over_labels(
         materials: of each label that occurs.
 
     Raises:
-        MaterialError: a label that occurs has no material.
+        MeshError: a label that occurs has no material.
     """
     missing = [int(label) for label in fractions.labels if int(label) not in materials]
     if missing:
-        raise MaterialError(
+        raise MeshError(
             f"label {missing[0]} fills {fractions.for_label(missing[0]).sum():.2f} tetrahedra "
             f"but has no material: add one for it"
         )
