@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import SceneError
 from us_sim.geometry.collider import Collider
@@ -57,7 +57,6 @@ _ALONG, _ROUND, _LATITUDES = 16, 6, 6
 _NOSE = 0.006  # m, of the face's part that is straight behind its rounding
 # m, lengths of the taper, the grip, its rounded end, and the cable's stub.
 _SHOULDER, _GRIP, _END, _CABLE = 0.022, 0.058, 0.010, 0.065
-_NARROWEST, _WIDEST = 0.024, 0.034  # m, a grip across its flat, as a hand holds it
 _CABLE_RADIUS = 0.0028
 _NOTCH = (0.0016, 0.0022, 0.009)  # m, half the orientation notch's height, width and length
 FACE, HOUSING = (0.20, 0.23, 0.26), (0.86, 0.88, 0.89)
@@ -76,38 +75,33 @@ class TransducerPart:
 
 def build_transducer_mesh(collider: Collider) -> list[TransducerPart]:
     """Build the parts of a transducer whose face has the shape of ``collider``."""
-    box = collider.offset_box
-    half_x, half_y, rounding = float(box[0]), float(box[1]), float(box[3])
-    curvature = float(box[4]) if len(box) > 4 else 0.0
-    front, side = _face_rings(half_x, half_y, rounding, curvature)
-    behind = float(side[:, 2].min())
-    nose = _flat_ring(half_x, half_y, rounding, behind - _NOSE)
-    width, depth = 2 * (half_x + rounding), 2 * (half_y + rounding)
-    grip_x = min(max(0.62 * width, _NARROWEST), _WIDEST) / 2
-    grip_y = min(max(1.15 * depth, 0.018), 0.024) / 2
-    top = behind - _NOSE
+    half_x, half_y, _, rounding, *bent = collider.offset_box.tolist()
+    front, side = _face_rings(half_x, half_y, rounding, *bent)
+    top = float(side[:, 2].min()) - _NOSE
     end = top - _SHOULDER - _GRIP
+    face = np.array([half_x, half_y, rounding])
+    nose = _flat_ring(face, top)
+    width, depth = 2 * (half_x + rounding), 2 * (half_y + rounding)
+    grip_x = min(max(0.62 * width, 0.024), 0.034) / 2  # as a hand holds it
+    grip_y = min(max(1.15 * depth, 0.018), 0.024) / 2
     # From a box of the face's shape to a rounder one of the grip's.
     round_grip = 0.9 * min(grip_x, grip_y)
     grip = np.array([grip_x - round_grip, grip_y - round_grip, round_grip])
     housing = [nose]
     for part in np.linspace(0.0, 1.0, 9)[1:]:
         ease = 0.5 - 0.5 * math.cos(math.pi * part)
-        x, y, radius = (1 - ease) * np.array([half_x, half_y, rounding]) + ease * grip
-        housing.append(_flat_ring(x, y, radius, top - _SHOULDER * part))
+        housing.append(_flat_ring((1 - ease) * face + ease * grip, top - _SHOULDER * part))
     # The end is rounded: an ellipse's quarter, into which the cable leads.
     for angle in np.radians([0.0, 25.0, 50.0, 70.0, 85.0]):
-        x, y, radius = math.cos(angle) * grip
-        housing.append(_flat_ring(x, y, radius, end - _END * math.sin(angle)))
-    cable = [_flat_ring(0.0, 0.0, _CABLE_RADIUS, end - way) for way in (0.0, _END + _CABLE)]
+        housing.append(_flat_ring(math.cos(angle) * grip, end - _END * math.sin(angle)))
+    cable = [_flat_ring([0.0, 0.0, _CABLE_RADIUS], end - way) for way in (0.0, _END + _CABLE)]
     high, wide, long = _NOTCH
-    middle = top - _SHOULDER - 0.012
     # At -x, on the side of the image's first column: the mark is at the image's left.
-    half_turn = np.array([-1.0, -1.0, 1.0])
-    notch = []
-    for scale, size in ((-0.8, (1.0, long / wide)), (0.2, (1.0, long / wide)), (1.0, (0.6, 3))):
-        ring = _turn_ring(_flat_ring(0, 0, wide, 0), size)
-        notch.append(half_turn * (np.array([grip_x + high * scale, 0.0, middle]) + ring))
+    circle = _flat_ring([0.0, 0.0, wide], 0.0)[:, [2, 0, 1]]  # around x
+    notch = [
+        circle * [1.0, *size] + [-grip_x - high * out, 0.0, top - _SHOULDER - 0.012]
+        for out, size in ((-0.8, (1.0, long / wide)), (0.2, (1.0, long / wide)), (1.0, (0.6, 3.0)))
+    ]
     return [
         _build_part("face", FACE, [*front, side, nose], has_front=False),
         _build_part("housing", HOUSING, housing),
@@ -128,22 +122,22 @@ def _outline(half_x: float, half_y: float) -> tuple[NDArray[np.float64], NDArray
         if quarter in (0, 2):  # along the front and the back before their second corner
             points.append(np.column_stack([x * along, np.full_like(along, y * half_y)])[:-1])
             directions.append(np.tile([0.0, float(y)], (_ALONG, 1)))
-        start = (0.5 - 0.5 * quarter) * math.pi
-        angle = start - turn
+        angle = (0.5 - 0.5 * quarter) * math.pi - turn
         points.append(np.tile([x * half_x, y * half_y], (_ROUND + 1, 1)))
         directions.append(np.column_stack([np.cos(angle), np.sin(angle)]))
     return np.concatenate(points), np.concatenate(directions)
 
 
-def _flat_ring(half_x: float, half_y: float, rounding: float, z: float) -> NDArray[np.float64]:
-    """Return the outline (P, 3) m of a box, grown by a rounding, at a height z."""
+def _flat_ring(size: ArrayLike, z: float) -> NDArray[np.float64]:
+    """Return the outline (P, 3) m, at a height z, of a box of half x and y, grown by a rounding."""
+    half_x, half_y, rounding = np.asarray(size).tolist()
     points, directions = _outline(half_x, half_y)
     ring = points + rounding * directions
     return np.column_stack([ring, np.full(len(ring), z)])
 
 
 def _face_rings(
-    half_x: float, half_y: float, rounding: float, curvature: float
+    half_x: float, half_y: float, rounding: float, curvature: float = 0.0
 ) -> tuple[list[NDArray], NDArray]:
     """Return rings on the collider: of the front, from its middle line outwards; and of the side.
 
@@ -164,11 +158,6 @@ def _face_rings(
         normal = np.sin((1 - part) * between) * front + np.sin(part * between) * outward
         rings.append(core + rounding * normal / np.sin(between))
     return rings[:-1], rings[-1]
-
-
-def _turn_ring(ring: NDArray[np.float64], scale: tuple[float, float]) -> NDArray[np.float64]:
-    """Turn a ring around z into one around x, with sizes along y and z scaled."""
-    return np.column_stack([ring[:, 2], -ring[:, 0] * scale[0], ring[:, 1] * scale[1]])
 
 
 def _build_part(
@@ -192,15 +181,10 @@ def _build_part(
         triangles.append(np.column_stack([np.full(count, first), there, here]))
     back = (len(rings) - 1) * count
     triangles.append(np.column_stack([np.full(count, last), back + here, back + there]))
-    return TransducerPart(name, colour, *_merge_vertices(vertices, np.concatenate(triangles)))
-
-
-def _merge_vertices(vertices: NDArray, triangles: NDArray) -> tuple[NDArray, NDArray]:
-    """Merge vertices that lie on each other, to a nanometre; drop triangles that vanish."""
-    _, first, which = np.unique(
-        np.rint(vertices * 1e9), axis=0, return_index=True, return_inverse=True
-    )
-    corners = which.ravel()[triangles]
-    corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
+    places = np.rint(vertices * 1e9)  # vertices at the same nanometre are one
+    _, known, which = np.unique(places, axis=0, return_index=True, return_inverse=True)
+    corners = which.ravel()[np.concatenate(triangles)]
+    corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]  # others vanish
     used, corners = np.unique(corners, return_inverse=True)
-    return vertices[first][used], corners.reshape(-1, 3).astype(np.int32)
+    corners = corners.reshape(-1, 3)
+    return TransducerPart(name, colour, vertices[known][used], corners.astype(np.int32))
