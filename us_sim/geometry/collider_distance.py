@@ -45,10 +45,8 @@ def measure_distances(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Measure the distance of points to the collider's surface, and its outward normal there.
 
-    Every shape here is a box (for a sphere a point, for a capsule a segment) grown by a rounding;
-    the box of a curved array has a curved front. The formulas are exact. Where the nearest surface
-    point is not unique, on the core itself, the normal is the probe's +z if that is one of the
-    nearest directions.
+    The formulas are exact. Where the nearest surface point is not unique, on the core itself, the
+    normal is the probe's +z if that is one of the nearest directions.
 
     Returns:
         (N,) m, negative inside, and (N, 3) unit normals, in the frame of pose and points (N, 3) m.

@@ -35,9 +35,7 @@ def read_with_meshio(path: Path, refusal: str) -> Any:
         for block in mesh.cells:
             # An index below 0 would count from the last point.
             if len(block.data) and not 0 <= np.min(block.data) <= np.max(block.data) < count:
-                raise MeshError(
-                    f"the file has cells that name points beyond the {count} that are there"
-                )
+                raise MeshError(f"the file has cells that name points beyond its {count}")
         return mesh
     except MeshError:
         raise

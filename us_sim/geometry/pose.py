@@ -1,4 +1,4 @@
-"""Rigid transforms in metres and unit quaternions (x, y, z, w), and trees of frames."""
+"""Rigid transforms in metres and unit quaternions (x, y, z, w)."""
 
 from __future__ import annotations
 
@@ -57,9 +57,8 @@ class Pose:
             raise PoseError("the pose's quaternion is zero, so it has no orientation")
         if max(map(abs, place)) > _FARTHEST:
             raise PoseError(f"the pose is at {place}, beyond any place: positions are in metres")
-        position.flags.writeable = False
         orientation /= norm
-        orientation.flags.writeable = False
+        position.flags.writeable = orientation.flags.writeable = False
         object.__setattr__(self, "position", position)
         object.__setattr__(self, "orientation", orientation)
 
@@ -74,9 +73,8 @@ class Pose:
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
             raise PoseError("a rigid transform is a finite 4×4 matrix")
         rotation = matrix[:3, :3]
-        if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) or (
-            np.linalg.det(rotation) < 0
-        ):
+        is_orthogonal = np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3)
+        if not is_orthogonal or np.linalg.det(rotation) < 0:
             raise PoseError("the matrix is not rigid: its upper left 3×3 block is not a rotation")
         from scipy.spatial.transform import Rotation  # which most that hold poses do without
 

@@ -62,8 +62,7 @@ def rotation_between(
     first: NDArray[np.float64], second: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Rotation vector (3,) rad about the parent's axes that turns the first into the second."""
-    x, y, z, w = first.tolist()
-    return rotation_log(multiply_quaternions(second, np.array([-x, -y, -z, w])))
+    return rotation_log(multiply_quaternions(second, first * [-1.0, -1.0, -1.0, 1.0]))
 
 
 def left_jacobian(vector: NDArray[np.float64]) -> NDArray[np.float64]:
