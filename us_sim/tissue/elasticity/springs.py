@@ -8,7 +8,6 @@ Theory of Crystal Lattices, 1954, section 11).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,23 +16,10 @@ from scipy.sparse import csr_array
 
 from us_sim.kernels import njit
 from us_sim.tissue.elasticity.materials import TissueMaterials
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
-
-# The six edges of a tetrahedron.
-_CORNERS = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+from us_sim.tissue.mesh.tetrahedral_mesh import EDGES, TetrahedralMesh
 
 
-class SpringArrays(NamedTuple):
-    """The arrays of a `SpringNetwork` that kernels take."""
-
-    edges: NDArray[np.int32]  # (E, 2)
-    stiffness: NDArray[np.float64]  # (E,), N/m
-    damping: NDArray[np.float64]  # (E,), N s/m
-    rest_length: NDArray[np.float64]  # (E,), m
-
-
-@dataclass(frozen=True, eq=False)
-class SpringNetwork:
+class SpringNetwork(NamedTuple):
     """Voigt elements: a spring and a damper side by side (the paper's appendix)."""
 
     edges: NDArray[np.int32]  # (E, 2), the nodes it joins
@@ -41,19 +27,12 @@ class SpringNetwork:
     damping: NDArray[np.float64]  # (E,), N s/m
     rest_length: NDArray[np.float64]  # (E,), m
 
-    @property
-    def arrays(self) -> SpringArrays:
-        """The arrays that kernels take."""
-        return SpringArrays(self.edges, self.stiffness, self.damping, self.rest_length)
-
     def compute_forces(
         self, positions: NDArray[np.float64], velocity: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return (N, 3) N on the nodes, for positions (N, 3) m and velocities (N, 3) m/s."""
         force = np.empty_like(positions)
-        spring_forces(
-            self.arrays, np.ascontiguousarray(positions), np.ascontiguousarray(velocity), force
-        )
+        spring_forces(self, np.ascontiguousarray(positions), np.ascontiguousarray(velocity), force)
         return force
 
     def drop_fixed(self, fixed: NDArray[np.bool_]) -> SpringNetwork:
@@ -112,7 +91,7 @@ def fit_springs(
         materials: of its tetrahedra.
         damping_factor: s, damping constant over spring constant.
     """
-    ends = mesh.nodes[mesh.tetrahedra][:, _CORNERS]
+    ends = mesh.nodes[mesh.tetrahedra][:, EDGES]
     squares = ((ends[:, :, 1] - ends[:, :, 0]) ** 2).sum(axis=(1, 2))
     shear = materials.young_modulus / 2.5
     return _network(mesh, 15 * shear * mesh.volumes / squares, damping_factor)
@@ -120,18 +99,15 @@ def fit_springs(
 
 def _network(mesh: TetrahedralMesh, stiffness: NDArray, damping_factor: float) -> SpringNetwork:
     """Make six equal springs of stiffness (M,) N/m in each tetrahedron; duplicates merge."""
+    ends = np.sort(mesh.tetrahedra[:, EDGES].astype(np.int64), axis=2)
+    count = len(mesh.nodes)
+    known = mesh.edges[:, 0].astype(np.int64) * count + mesh.edges[:, 1]
+    which = np.searchsorted(known, ends[:, :, 0] * count + ends[:, :, 1])
     merged = np.zeros(len(mesh.edges))
-    np.add.at(merged, _edges_of_tetrahedra(mesh), stiffness[:, None])
+    np.add.at(merged, which, stiffness[:, None])
     rest_length = np.empty(len(mesh.edges))
     _lengths(mesh.edges, mesh.nodes, rest_length)
     return SpringNetwork(mesh.edges, merged, damping_factor * merged, rest_length)
-
-
-def _edges_of_tetrahedra(mesh: TetrahedralMesh) -> NDArray[np.intp]:
-    ends = np.sort(mesh.tetrahedra[:, _CORNERS].astype(np.int64), axis=2)
-    count = len(mesh.nodes)
-    known = mesh.edges[:, 0].astype(np.int64) * count + mesh.edges[:, 1]
-    return np.searchsorted(known, ends[:, :, 0] * count + ends[:, :, 1])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

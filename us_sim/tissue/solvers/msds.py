@@ -217,7 +217,7 @@ class Msds(TissueSolver):
         self._contact.touched[:] = False
         self._contact.wrench[:] = 0.0
         advance_frame(
-            self._springs.arrays,
+            self._springs,
             self._particles,
             probe,
             self._contact,
@@ -331,7 +331,7 @@ def advance_frame(springs, particles, probe, contact, time_step, substeps, steps
     """Move the particles by ``steps`` of ``substeps`` of ``time_step`` (s), by symplectic Euler.
 
     Args:
-        springs: their `SpringArrays`.
+        springs: their `SpringNetwork`.
         particles: `Particles`, moved here.
         probe: `ProbeMotion` of S = ``steps`` steps, or of none.
         contact: `ParticleContact`, filled in here as of the last sub-step; its wrench is added to.
