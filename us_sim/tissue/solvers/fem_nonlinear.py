@@ -210,16 +210,13 @@ class FemNonlinear(TissueSolver):
             moved=moved,
             restarted=self._recovery.take_restart(),
         )
-        if self._is_unloaded(pose):
+        if pose is None or newton.measure_depth_at_rest(pose) <= GAP_TOLERANCE:
             # Nothing reaches the tissue at rest: it is the solution.
             self._restore(TissueState.at_rest(len(self.model.mesh.nodes)))
             self._settled = True
             return self._resting()
         motion, start = np.inf, None  # m, that updating the contact causes; guess of the first step
-        if pose is None:
-            newton.remove_probe()
-            self._target = None
-        elif not moved:
+        if not moved:
             motion = newton.update_contact() if self._was_balanced else np.inf
         elif len(self._surface):
             if self._catches_up:
@@ -291,10 +288,6 @@ class FemNonlinear(TissueSolver):
             return True
         return newton.contact_norm > 0.0 and newton.displacement_error > tolerance
 
-    def _is_unloaded(self, pose: Pose | None) -> bool:
-        """Return whether nothing reaches the tissue at rest."""
-        return pose is None or self._newton.measure_depth_at_rest(pose) <= GAP_TOLERANCE
-
     def _next_step(self, pose: Pose) -> Pose:
         """Return the next load step on the way to a pose; the last one until that is in balance."""
         newton, last = self._newton, self._target
@@ -356,9 +349,7 @@ class FemNonlinear(TissueSolver):
             "of its volume"
         )
 
-    def _make_deformation(
-        self, pose: Pose | None, motion: float, actions: list[str]
-    ) -> Deformation:
+    def _make_deformation(self, pose: Pose, motion: float, actions: list[str]) -> Deformation:
         newton, recovery = self._newton, self._recovery
         interventions = Intervention.NONE
         reached = newton.displacement
@@ -377,9 +368,7 @@ class FemNonlinear(TissueSolver):
         forces = newton.contact_forces[:, self.model.contact_nodes].T
         pushed = forces.any(axis=1)
         touched, forces = self.model.contact_nodes[pushed], forces[pushed]
-        force, torque = np.zeros(3), np.zeros(3)
-        if pose is not None:
-            force, torque = wrench_on_probe(pose, nodes[touched], forces)
+        force, torque = wrench_on_probe(pose, nodes[touched], forces)
         if not recovery.inverted_frames:
             balanced = residual <= self.settings.tolerance and motion <= self._settled_motion
             self._settled |= balanced

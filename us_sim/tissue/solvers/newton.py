@@ -159,13 +159,6 @@ class Newton:
         self._drop_factor()
         self._assemble_contact()
 
-    def remove_probe(self) -> None:
-        """Take the probe away; nothing moves."""
-        self.contact.clear()
-        self._carried_force = self.contact.normal_force
-        self._damping = 0.0
-        self._assemble_contact()
-
     def update_contact(self) -> float:
         """Update the direction of contact forces at the end of a frame.
 
