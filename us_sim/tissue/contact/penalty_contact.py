@@ -82,8 +82,6 @@ class PenaltyContact:
     ) -> None:
         self.probe = probe
         self.stiffness = stiffness  # (P,) N/m, with which springs begin
-        self._greatest_force = greatest_force
-        self._stiffening = stiffening
         # The real root of k d (1 + (d / d1)^2) = F, for d / d1, after Cardano.
         half = greatest_force / (2 * stiffness * stiffening)
         root = np.cbrt(half + np.sqrt(half * half + 1 / 27))
@@ -185,12 +183,8 @@ class PenaltyContact:
     def _measure(self, gap: NDArray[np.float64]) -> None:
         self.gap = gap + self._relief  # (P,) m, infinite where the probe cannot push
         self.normal_force = np.zeros_like(gap)  # (P,) N, along the normal
-        self._energy = _normal_forces(self.near, self.gap, *self._law, self.normal_force)
-
-    @property
-    def energy(self) -> float:
-        """J, of all springs."""
-        return self._energy
+        #: J, of all springs.
+        self.energy = float(_normal_forces(self.near, self.gap, *self._law, self.normal_force))
 
     @property
     def slope(self) -> NDArray[np.float64]:
