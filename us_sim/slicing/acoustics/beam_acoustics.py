@@ -257,22 +257,17 @@ class ElectronicNoise:
         shown = np.isfinite(distance)
         mean = level + rise * np.nan_to_num(distance)
         random = np.random.Generator(np.random.PCG64(5))
-        self._frames = [self._frame(random, mean, shown) for _ in range(_FRAMES)]
-
-    @staticmethod
-    def _frame(
-        random: np.random.Generator, mean: NDArray[np.float32], shown: NDArray[np.bool_]
-    ) -> NDArray[np.uint8]:
-        power = np.zeros(mean.shape, dtype=np.float32)
-        for _ in range(2):  # in phase and in quadrature
-            wave = random.standard_normal(mean.shape, dtype=np.float32)
-            wave = np.asarray(cv2.GaussianBlur(wave, (0, 0), _GRAIN[0], sigmaY=_GRAIN[1]))
-            power += wave * wave
-        power /= power.mean()
-        level = mean + 10.0 * np.log10(np.maximum(power, 1e-4)) + ECHO_RANGE
-        grey = np.clip(level * GREYS_PER_DECIBEL, 0.0, 255.0)
-        grey[~shown] = 0.0
-        return grey.astype(np.uint8)
+        self._frames: list[NDArray[np.uint8]] = []
+        for _ in range(_FRAMES):
+            power = np.zeros(mean.shape, dtype=np.float32)
+            for _ in range(2):  # in phase and in quadrature
+                wave = random.standard_normal(mean.shape, dtype=np.float32)
+                wave = np.asarray(cv2.GaussianBlur(wave, (0, 0), _GRAIN[0], sigmaY=_GRAIN[1]))
+                power += wave * wave
+            power /= power.mean()
+            level = mean + 10.0 * np.log10(np.maximum(power, 1e-4)) + ECHO_RANGE
+            grey = np.clip(level * GREYS_PER_DECIBEL, 0.0, 255.0)
+            self._frames.append(np.where(shown, grey, 0.0).astype(np.uint8))
 
     def make_noise(self, pose: Pose) -> NDArray[np.uint8]:
         """Return (rows, columns) grey levels of noise with the probe at a pose."""

@@ -54,7 +54,7 @@ def collect_label_constants(volume: Volume, acoustics: Acoustics) -> dict[int, T
     found = {}
     for label, name in names.items():
         try:
-            found[label] = acoustics.get_constants(name)
+            found[label] = acoustics.tissues.get(name, TissueAcoustics()).fill_from_table(name)
         except ProbeError as error:
             raise acoustics.make_error(f"tissues.{error.key}", error.problem) from error
     return found

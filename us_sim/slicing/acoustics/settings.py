@@ -41,18 +41,6 @@ _CONSTANTS: tuple[tuple[float, float, str], ...] = (
 _TABLE = {
     word: (loss, impedance) for loss, impedance, words in _CONSTANTS for word in words.split()
 }
-
-
-def find_table_constants(name: str) -> tuple[float, float] | None:
-    """Return attenuation (dB/cm/MHz) and impedance (Rayl) of the tissue that a label names.
-
-    Of several known words in a name the last one counts; None where there is none. Attenuation is
-    taken as proportional to the frequency: the source's coefficient at 1 MHz.
-    """
-    words = [word for word in re.split(r"[^a-z]+", name.lower()) if word in _TABLE]
-    return _TABLE[words[-1]] if words else None
-
-
 _FREQUENCY = Quantity("frequency", 0.5e6, 50e6)
 
 
@@ -108,20 +96,23 @@ class TissueAcoustics(Settings):
     def fill_from_table(self, name: str) -> TissueAcoustics:
         """Fill in the textbook's constants of a label's name where none are given.
 
+        Of several known words in a name the last one counts. Attenuation is taken as proportional
+        to the frequency: the source's coefficient at 1 MHz.
+
         Raises:
             ProbeError: the textbook has none for that name; ``key`` says which.
         """
-        found = find_table_constants(name)
+        words = [word for word in re.split(r"[^a-z]+", name.lower()) if word in _TABLE]
         values: dict[str, Any] = {}
         for place, key in enumerate(("attenuation", "impedance")):
             if getattr(self, key) is None:
-                if found is None:
+                if not words:
                     raise self.make_error(
                         f"{name}.{key}",
                         f"is missing, and the table of textbooks' constants has no tissue of the "
                         f"name `{name}`: give its {key}",
                     )
-                values[key] = found[place]
+                values[key] = _TABLE[words[-1]][place]
         return dataclasses.replace(self, **values) if values else self
 
 
@@ -197,11 +188,3 @@ class Acoustics(SoundSettings):
     tissues: Mapping[str, TissueAcoustics] = setting(
         description="constants by label; of what is not said, the textbook's", default_factory=dict
     )
-
-    def get_constants(self, name: str) -> TissueAcoustics:
-        """Return the constants of the tissue with a label of that name.
-
-        Raises:
-            ProbeError: it has none.
-        """
-        return self.tissues.get(name, TissueAcoustics()).fill_from_table(name)

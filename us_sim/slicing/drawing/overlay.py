@@ -60,23 +60,18 @@ class TextPatch:
 @lru_cache(maxsize=64)
 def render_text(text: str, height: int, colour: Colour) -> TextPatch:
     """Render ``text`` with capital letters about ``height`` px high."""
-    letters = _letters(text, height)
-    padded = np.pad(letters, _HALO)
-    halo = cv2.GaussianBlur(cv2.dilate(padded, np.ones((3, 3), np.uint8)), (3, 3), 0.0)
-    opacity = np.maximum(padded, 0.8 * halo)
-    letters = np.divide(padded, opacity, out=np.zeros_like(padded), where=opacity > 0)
-    colours = np.rint(letters[:, :, None] * np.array(colour, np.float32)).astype(np.uint8)
-    return TextPatch(colours, opacity)
-
-
-def _letters(text: str, height: int) -> NDArray[np.float32]:
     large = _FINER * height
     letters = _cropped(text, large, _scale(large))
     rows, columns = (-(-side // _FINER) for side in letters.shape)
     whole = np.zeros((rows * _FINER, columns * _FINER), np.uint8)
     whole[: letters.shape[0], : letters.shape[1]] = letters
     averaged = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
-    return averaged.astype(np.float32) / np.float32(255)
+    padded = np.pad(averaged.astype(np.float32) / np.float32(255), _HALO)
+    halo = cv2.GaussianBlur(cv2.dilate(padded, np.ones((3, 3), np.uint8)), (3, 3), 0.0)
+    opacity = np.maximum(padded, 0.8 * halo)
+    share = np.divide(padded, opacity, out=np.zeros_like(padded), where=opacity > 0)
+    colours = np.rint(share[:, :, None] * np.array(colour, np.float32)).astype(np.uint8)
+    return TextPatch(colours, opacity)
 
 
 @lru_cache(maxsize=64)

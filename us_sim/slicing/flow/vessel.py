@@ -244,9 +244,8 @@ class Vessel:
 
     def apply_settings(self, settings: FlowSettings) -> None:
         """Apply other settings from now on; blood that has filled up stays."""
-        sign = self.find_flow_sign(settings)
+        self._sign = self.find_flow_sign(settings)
         self.settings = settings
-        self._sign = sign
         self._waveform = Waveform(settings)
         lumen = self._plain
         self._circulation = Circulation(settings, lumen.areas, lumen.spacing, self._circulation)
@@ -289,11 +288,6 @@ Arteries, 5th ed., 2005, chapter 2: 3 to 4)."""
 _SHUT = 1e-3
 """Open fraction of a lumen below which it is shut: its resistance is a million times that at rest,
 and what is left of the flow not to be seen."""
-
-
-def compute_open_fraction(area: NDArray[np.float64], closed_at: float) -> NDArray[np.float64]:
-    """Return the open part of a lumen, from its area over that at rest and that at closure."""
-    return np.asarray(np.maximum(area - closed_at, 0.0) / (1.0 - closed_at))
 
 
 class Circulation:
@@ -346,7 +340,8 @@ class Circulation:
 
         Where time goes back, as when a recording begins again, the reservoir is as at rest.
         """
-        open_ = compute_open_fraction(areas / self._rest_areas, self._closed_at)
+        closed_at = self._closed_at
+        open_ = np.maximum(areas / self._rest_areas - closed_at, 0.0) / (1.0 - closed_at)
         conductance = 0.0
         if open_.min() > _SHUT:
             vessel = float((self._resistances / open_**2).sum())
@@ -377,9 +372,6 @@ class Waveform:
     Thrush, Diagnostic Ultrasound: Physics and Equipment, 2nd ed., 2010, chapter 9): three bells,
     scaled to the peak and mean that are set. Flow in a vein swings with breathing, and a little
     with the heart (Baekgaard and Strandberg, Phlebolymphology, 2016).
-
-    Args:
-        settings: of the vessel's flow.
     """
 
     def __init__(self, settings: FlowSettings) -> None:

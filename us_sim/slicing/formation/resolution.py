@@ -25,9 +25,8 @@ amplitude, and its standard deviation is √2 times less."""
 
 _REACH = 3.0  # standard deviations after which the point spread counts as 0
 
-_PULSE_GROWTH = (
-    10.0  # 1/m: attenuation takes the high frequencies, so 10 cm deep it is twice as long
-)
+# 1/m: attenuation takes the high frequencies, so 10 cm deep the pulse is twice as long.
+_PULSE_GROWTH = 10.0
 
 _FINEST = 1 << 16  # entries of the table of levels; a step is a 65th of the faintest amplitude
 _LINE_STEP = 1.0  # pixels between the lines of a fan that is resampled, where they are widest
@@ -154,22 +153,13 @@ def _point_spreads(
     return weights.astype(np.float32), reach
 
 
-def _powers() -> NDArray[np.float32]:
-    """Return (256,) the power of each grey value, 1 for 255 and nothing for 0."""
-    power = 10.0 ** ((np.arange(256) / 255.0 - 1.0) * ECHO_RANGE / 10.0)
-    power[0] = 0.0
-    return power.astype(np.float32)
-
-
-def _levels() -> NDArray[np.uint8]:
-    """Return (`_FINEST` + 1,) the grey value of each evenly spaced amplitude from 0 to 1."""
-    amplitude = np.maximum(np.arange(_FINEST + 1), 0.25) / _FINEST
-    level = 255.0 * (1.0 + 20.0 * np.log10(amplitude) / ECHO_RANGE)
-    return np.clip(np.floor(level + 0.5), 0, 255).astype(np.uint8)
-
-
-_POWERS = _powers()
-_LEVELS = _levels()
+# (256,) power of each grey value, 1 for 255 and nothing for 0.
+_POWERS = (10.0 ** ((np.arange(256) / 255.0 - 1.0) * ECHO_RANGE / 10.0)).astype(np.float32)
+_POWERS[0] = 0.0
+# (`_FINEST` + 1,) grey value of each evenly spaced amplitude from 0 to 1.
+_AMPLITUDES = np.maximum(np.arange(_FINEST + 1), 0.25) / _FINEST
+_LEVELS = np.floor(255.0 * (1.0 + 20.0 * np.log10(_AMPLITUDES) / ECHO_RANGE) + 0.5)
+_LEVELS = np.clip(_LEVELS, 0, 255).astype(np.uint8)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
