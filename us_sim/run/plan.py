@@ -131,9 +131,8 @@ def require_free_port(plan: Plan) -> None:
     """Raise UsSimError where the page's address or port cannot be listened at."""
     for process in plan.processes:
         if process.node == VIEWER:
-            require_free_address(
-                str(process.parameters["host"]), int(str(process.parameters["port"]))
-            )
+            page = process.parameters
+            require_free_address(str(page["host"]), int(str(page["port"])))
 
 
 def require_new(recording: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator
 from decimal import Decimal
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +68,8 @@ def write_parts(
         table = head.join(values.rename(columns=_UNITS))
         yield write_table(folder / f"{_file_name(name)}.csv", table, na_rep="nan")
     if "images" in parts:
-        images = [_write_images(bag, name, folder, progress) for name in needed["images"]]
-        made = [*chain.from_iterable(images)]
+        named = needed["images"]
+        made = [each for name in named for each in _write_images(bag, name, folder, progress)]
         yield from made
         if not any(isinstance(each, Path) for each in made):
             raise BagError(f"{bag.path} holds no image that can be decoded")
