@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from PIL import Image
 
 from us_sim.errors import UsSimError
 from us_sim.evaluation import subject as engine
@@ -69,7 +70,11 @@ def test_a_subject_writes_table_picture_and_page_whatever_breaks(toy, tmp_path, 
     ):
         assert part in page
     assert "## Nothing" not in page
-    assert (out / "toy_error.png").stat().st_size > 5000
+    with Image.open(out / "toy_error.png") as picture:
+        assert picture.mode == "P"  # for a small file
+        colours = np.asarray(picture.convert("RGB")).reshape(-1, 3).astype(int)
+    for wanted in ((255, 255, 255), (0x00, 0x72, 0xB2)):  # the paper, and the marks of a line
+        assert np.abs(colours - wanted).max(axis=1).min() < 4
     assert "`fem` is fast." in capsys.readouterr().out
     with pytest.raises(UsSimError, match="exists"):
         toy(out, True)
