@@ -317,7 +317,7 @@ class HapticRendering:
     def _unilateral(self, felt: Array) -> Array:
         """Return the wrench, less a force that would pull the handle against the tissue's push."""
         assert self._model is not None
-        push = self._device.rotate_to_handle(self._model.push)
+        push = self._model.push @ self._device.to_patient
         pulled = float(felt[:3] @ push)
         if pulled < 0.0:
             felt[:3] -= pulled * push
@@ -380,7 +380,7 @@ class HapticDevice:
         #: Work on the handle over work on the probe.
         self.work_ratio = settings.force_scale / settings.scale
         registration, calibration = registration or Pose(), calibration or Pose()
-        self._turn = registration.rotation
+        self.to_patient = registration.rotation  # (3, 3), of vectors along the arm's axes
         #: (3,) m, from the handle's origin to the probe's, along the probe's axes.
         self._lever = calibration.rotation.T @ calibration.position
         self.reset()
@@ -433,8 +433,8 @@ class HapticDevice:
             (6,) m, rad: displacement of its origin, and rotation vector, axes of ``patient``.
         """
         moved = np.empty(6)
-        moved[:3] = self._turn @ (self._scale * (now.position - before.position))
-        moved[3:] = self._turn @ se3.rotation_between(before.orientation, now.orientation)
+        moved[:3] = self.to_patient @ (self._scale * (now.position - before.position))
+        moved[3:] = self.to_patient @ se3.rotation_between(before.orientation, now.orientation)
         if self._lever.any():
             arm = probe.rotation @ self._lever
             moved[:3] += _rotate(arm, moved[3:]) - arm
@@ -456,13 +456,9 @@ class HapticDevice:
             arm = _rotate(probe.rotation @ self._lever, turn)
             torque = torque + se3.cross_matrix(arm) @ force
         felt = np.empty(6)
-        felt[:3] = self._force_scale * (force @ self._turn)
-        felt[3:] = self.work_ratio * (torque @ self._turn)
+        felt[:3] = self._force_scale * (force @ self.to_patient)
+        felt[3:] = self.work_ratio * (torque @ self.to_patient)
         return felt
-
-    def rotate_to_handle(self, direction: Array) -> Array:
-        """Turn a direction (3,) from the axes of ``patient`` to those of the arm."""
-        return direction @ self._turn
 
 
 def _rotate(vector: Array, turn: Array) -> Array:

@@ -68,10 +68,8 @@ class SixDofMouse:
             step = 0.0
         before = self._twist
         self._stamp, self._twist = stamp, self._full * deflection
-        clutch, home = (
-            self._is_held(button, buttons)
-            for button in (self._settings.clutch_button, self._settings.reset_button)
-        )
+        clutch = self._is_held(self._settings.clutch_button, buttons)
+        home = self._is_held(self._settings.reset_button, buttons)
         if home:
             self.pose = self._home
         elif not clutch:

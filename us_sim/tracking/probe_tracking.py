@@ -28,7 +28,6 @@ class ProbeTracking:
         lost_after: s without a pose after which it is *lost*, and the next one starts anew.
 
     Examples:
-        >>> import numpy as np
         >>> from us_sim.geometry.pose import Pose
         >>> from us_sim.tracking.settings import GateSettings
         >>> from us_sim.tracking.measurement import Measurement

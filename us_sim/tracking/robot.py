@@ -141,13 +141,9 @@ class Robot:
         given = self._settings
         passed = 0.0 if self._time is None else min(max(time - self._time, 0.0), LONGEST_STEP)
         self._time = time
-        wanted = self._wanted_velocity(time)
-        for part, most in (
-            (slice(3), given.acceleration),
-            (slice(3, 6), given.angular_acceleration),
-        ):
-            change = wanted[part] - self._velocity[part]
-            self._velocity[part] += _shorten(change, most * passed)
+        change = self._wanted_velocity(time) - self._velocity
+        self._velocity[:3] += _shorten(change[:3], given.acceleration * passed)
+        self._velocity[3:] += _shorten(change[3:], given.angular_acceleration * passed)
         moved = self.pose @ exp(self._velocity * passed)
         self.pose = clip_to_reach(moved, self.pose, given)
         return self.pose
