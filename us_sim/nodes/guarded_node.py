@@ -7,7 +7,7 @@ import os
 import time
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import numpy as np
@@ -105,15 +105,11 @@ class GuardedNode(Node):
         queue = NewestQueue(self) if newest and not self.lockstep else None
 
         def on_message(message: Any) -> None:
-            self.arrived = time.monotonic_ns()
             self.health.received += not is_latched
-            try:
-                callback(queue.drain_to_newest(subscription, message) if queue else message)
-            except Exception as error:
-                self.handle_error(where, error)
+            callback(queue.drain_to_newest(subscription, message) if queue else message)
 
         subscription: Subscription = self.create_subscription(
-            *(message_type, topic, on_message, qos),
+            *(message_type, topic, self.guard_callback(where, on_message), qos),
             raw=raw,
             qos_overriding_options=qos_override_options(),
         )
@@ -308,6 +304,16 @@ def loggable_text(sentence: str) -> str:
     return printable_line(" ".join(sentence[: LONGEST + 1].split()), LONGEST)
 
 
+def status_message(
+    name: str, message: str, values: Mapping[str, Any], hardware_id: str, level: bytes
+) -> DiagnosticStatus:
+    """Make a status of diagnostics with values as text."""
+    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+    return DiagnosticStatus(
+        level=level, name=name, message=message, hardware_id=hardware_id, values=pairs
+    )
+
+
 class Health:
     """Counts of a node's work, published on ``diagnostics`` at 1 Hz.
 
@@ -325,7 +331,7 @@ class Health:
 
     def __init__(self, node: GuardedNode, hardware_id: str | None = None) -> None:
         self._node = node
-        self._hardware_id = hardware_id
+        self._hardware_id = hardware_id or ""
         self._latencies: deque[float] = deque(maxlen=1000)  # ms
         self._published: Counter[str] = Counter()
         self._problems: Counter[str] = Counter()
@@ -410,17 +416,13 @@ class Health:
             f"right: synchronise the computers' clocks, with chrony or PTP"
         )
         wrong = self.fault or self._last_problem or self.warning or (skew if ahead >= 1.0 else "")
-        level = DiagnosticStatus.WARN if wrong else DiagnosticStatus.OK
-        if node.failures.total() > self._failures_told:
+        has_failed = node.failures.total() > self._failures_told
+        if has_failed:
             self._failures_told, wrong = node.failures.total(), node.last_failure
-            level = DiagnosticStatus.ERROR
-        status = DiagnosticStatus(
-            level=DiagnosticStatus.ERROR if self.fault else level,
-            name=node.get_fully_qualified_name(),
-            message=wrong or self.state,
-            hardware_id=self._hardware_id,
-            values=[KeyValue(key=key, value=value) for key, value in values.items()],
-        )
+        level = DiagnosticStatus.WARN if wrong else DiagnosticStatus.OK
+        level = DiagnosticStatus.ERROR if has_failed or self.fault else level
+        name = node.get_fully_qualified_name()
+        status = status_message(name, wrong or self.state, values, self._hardware_id, level)
         message = DiagnosticArray(status=[status])
         message.header.stamp = node.get_clock().now().to_msg()
         self._publisher.publish(message)

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from visualization_msgs.msg import MarkerArray
 
 from us_sim.geometry.transducer import build_transducer_mesh
+from us_sim.nodes.guarded_node import status_message
 from us_sim.nodes.messages import (
     MarkerShape,
     pose_message,
@@ -177,17 +178,11 @@ class ProbeTracker(TrackerNode):
         self._publish_status()
 
     def _publish_status(self) -> None:
-        status = DiagnosticStatus(
-            level=LEVELS[self._state],
-            name="probe",
-            message=self._state.value,
-            hardware_id=self._source,
-        )
-        refused = self._tracking.refused
+        state, refused = self._state, self._tracking.refused
         values = {f"refused {kind}": str(count) for kind, count in refused.items()}
-        if self._last is not None and self._state is not TrackingState.TRACKED:
+        if self._last is not None and state is not TrackingState.TRACKED:
             values |= {"pose": pose_text(self._last.pose), "stamp": str(self._last.stamp)}
-        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        status = status_message("probe", state.value, values, self._source, LEVELS[state])
         self._status.publish(status)
 
 

@@ -12,7 +12,7 @@ from io import BytesIO
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import parameter_value_to_python
@@ -21,6 +21,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from us_sim import __version__
 from us_sim.errors import ScoreError
 from us_sim.geometry.pose import Pose
+from us_sim.nodes.guarded_node import status_message
 from us_sim.nodes.parameters import LiveSettings, declare_settings
 from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import EVERY
@@ -38,11 +39,8 @@ from us_sim.scoring.settings import CONTACT_FORCE, ScoreSettings
 
 _PERIOD = 200_000_000  # ns of the probe's poses, after which areas are measured again
 OWN = "scorer"
-_LEVELS = {  # by states of steps
-    "done": DiagnosticStatus.OK,
-    "missed": DiagnosticStatus.ERROR,
-    "to do": DiagnosticStatus.WARN,
-}
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+_LEVELS = {"done": OK, "missed": ERROR, "to do": WARN}  # by states of steps
 _REMEMBERED = 256  # poses, for the image with the same stamp
 _CHANGING = ("tissue_deformer", "skin_deformer", "slice_interpolator", "probe_tracker")
 """Nodes whose changed parameters are noted in the result."""
@@ -160,19 +158,18 @@ class Scorer(SceneNode):
 
     def _message(self, score: Score) -> DiagnosticArray:
         result = self._result(score)
-        first = _status(result["scene"], result["description"], result["metrics"])
-        first.name = result["name"]
-        message = DiagnosticArray(status=[first])
+        about, metrics = result["description"], result["metrics"]
+        statuses = [status_message(result["name"], about, metrics, result["scene"], OK)]
         for step in result["steps"]:
             places = {"target": json.dumps(step["target"])} if "target" in step else {}
-            status = _status("step", step["seen"], places, _LEVELS[step["state"]])
-            status.name = step["what"]
-            message.status.append(status)
+            level = _LEVELS[step["state"]]
+            statuses.append(status_message(step["what"], step["seen"], places, "step", level))
         for fault in result["faults"]:
             values = {"seconds": fault["seconds"]}
-            message.status.append(_status("fault", fault["what"], values, DiagnosticStatus.WARN))
-        message.status.append(_status("plain", result["state"], result["plain"]))
-        message.status.append(_status("about", "", result["about"]))
+            statuses.append(status_message("fault", fault["what"], values, "fault", WARN))
+        statuses.append(status_message("plain", result["state"], result["plain"], "plain", OK))
+        statuses.append(status_message("about", "", result["about"], "about", OK))
+        message = DiagnosticArray(status=statuses)
         message.header.stamp = self.get_clock().now().to_msg()
         return message
 
@@ -271,13 +268,6 @@ class Scorer(SceneNode):
         self._begin_attempt()
         self._picture.publish(CompressedImage())  # that of the former attempt goes
         return ""
-
-
-def _status(
-    kind: str, message: str, values: Mapping[str, Any], level: bytes = DiagnosticStatus.OK
-) -> DiagnosticStatus:
-    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-    return DiagnosticStatus(level=level, name=kind, message=message, hardware_id=kind, values=pairs)
 
 
 main = node_main(Scorer, __name__)

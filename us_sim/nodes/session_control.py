@@ -7,14 +7,14 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cache, partial
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from std_msgs.msg import Header
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.guarded_node import GuardedNode, Health
+from us_sim.nodes.guarded_node import GuardedNode, Health, status_message
 from us_sim.nodes.parameters import declare_settings, parameters_with, settings_with
 from us_sim.nodes.settings import SessionControlSettings
 from us_sim.scene.listing import ListedScene
@@ -93,12 +93,6 @@ class SessionControl(GuardedNode):
         """Publish the scenes and cases that can be loaded."""
         message = DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()))
         for scene in scenes:
-            status = DiagnosticStatus(
-                name=scene.name,
-                hardware_id=scene.origin,
-                level=DiagnosticStatus.ERROR if scene.problem else DiagnosticStatus.OK,
-                message=scene.problem or scene.description,
-            )
             about = {
                 "kind": scene.kind,
                 "region": scene.region,
@@ -106,8 +100,9 @@ class SessionControl(GuardedNode):
                 "probe": scene.probe,
                 "tracker": scene.tracker,
             }
-            status.values = [KeyValue(key=key, value=value) for key, value in about.items()]
-            message.status.append(status)
+            level = DiagnosticStatus.ERROR if scene.problem else DiagnosticStatus.OK
+            text = scene.problem or scene.description
+            message.status.append(status_message(scene.name, text, about, scene.origin, level))
         self._scenes.publish(message)
 
     def publish_bags(self, bags: Mapping[str, str]) -> None:
