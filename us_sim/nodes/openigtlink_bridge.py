@@ -45,6 +45,7 @@ class OpenIGTLinkBridge(SceneNode):
         self._image: Image | None = None
         self._connected = -1
         self._server = OpenIGTLinkServer(settings.host or "", settings.port)
+        self.port = self._server.port  # at which it listens
         self.subscribe(
             Float64MultiArray, "ultrasound/image_to_probe", self._on_image_place, LATCHED
         )
@@ -52,11 +53,6 @@ class OpenIGTLinkBridge(SceneNode):
         self.subscribe(Image, "ultrasound/image", self._on_image, newest=True)
         self.create_timer(CLIENTS_S, self._count_clients)
         self.get_logger().info(f"serving OpenIGTLink on port {self.port}")
-
-    @property
-    def port(self) -> int:
-        """Port at which the server listens."""
-        return self._server.port
 
     def destroy_node(self) -> None:
         """Disconnect all clients."""

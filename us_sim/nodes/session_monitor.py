@@ -16,11 +16,7 @@ TOLD = 50  # losses that a report lists, the newest
 
 
 class SessionMonitor(GuardedNode):
-    """Keeps the reports of each node, by its name without namespace.
-
-    Args:
-        nodes: that are followed.
-    """
+    """Keeps the reports of each of ``nodes``, by its name without namespace."""
 
     def __init__(self, nodes: Collection[str] = (), **kwargs: Any) -> None:
         super().__init__("session_monitor", **kwargs)

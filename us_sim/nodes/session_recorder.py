@@ -187,10 +187,9 @@ class SessionRecorder(GuardedNode):
 
     def _time_of_arrival(self, info: Mapping[str, Any]) -> int:
         """Return the time (ns) at which the middleware got a message; a busy recorder is later."""
-        clock: Any = self.get_clock()
         received: int = info.get("received_timestamp") or 0
-        is_known = received > 0 and not clock.ros_time_is_active  # which is another clock's
-        return received if is_known else int(clock.now().nanoseconds)
+        is_known = received > 0 and not self.is_time_simulated  # which is another clock's
+        return received if is_known else int(self.get_clock().now().nanoseconds)
 
     def _on_loss(self, topic: str, count: int) -> None:
         if self._bag is not None and not self._settings.paused:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ _BEYOND = 1e-3  # m, by which an image may be too deep without a report
 _NONE, _POOR = 0.02, 0.5  # coupling, averaged over the face, below which contact is none or poor
 _SEEN = ("contact", "no_colour", "no_spectrum")
 """Diagnostics that are sent at once when they change: the reasons of an empty image."""
+REST, TETRAHEDRA = "tissue/rest", "tissue/tetrahedra"
 REMEMBERED = 256  # poses kept for the deformed nodes that carry their stamps
 SKINS_REMEMBERED = 64
 
@@ -66,8 +68,7 @@ class SliceInterpolator(SceneNode):
         self.get_logger().info(f"preparing {self.scene.slice.name} on {self.scene.volume.name}")
         self._scanner.prepare_settings(probe, imaging, acoustics)
         self._scanner.apply_settings(probe, imaging, acoustics)
-        self._rest: Any = None
-        self._tetrahedra: Any = None
+        self._mesh: dict[str, Any] = {}  # messages by topic
         self._has_mesh = False
         self._poses: dict[int, Pose] = {}
         self._has_warned = False  # that the image is too deep
@@ -82,8 +83,8 @@ class SliceInterpolator(SceneNode):
         if self.scene.tissue is None:
             self.subscribe(PoseStamped, "probe/pose", self._on_rigid_pose, newest=True)
         else:
-            self.subscribe(PointCloud2, "tissue/rest", self._on_rest, LATCHED)
-            self.subscribe(Int32MultiArray, "tissue/tetrahedra", self._on_tetrahedra, LATCHED)
+            for kind, topic in ((PointCloud2, REST), (Int32MultiArray, TETRAHEDRA)):
+                self.subscribe(kind, topic, partial(self._on_mesh, topic), LATCHED)
             if self.scene.skin is not None and imaging.contact:
                 surface = load_skin_surface(self.scene)
                 self._scanner.attach_skin(surface.vertices, surface.triangles)
@@ -124,20 +125,12 @@ class SliceInterpolator(SceneNode):
             self._places.publish(affine_message(probe.image_to_probe))
             self._annotated.change_probe(probe)
 
-    def _on_rest(self, message: PointCloud2) -> None:
-        self._rest = message
-        self._take_mesh()
-
-    def _on_tetrahedra(self, message: Int32MultiArray) -> None:
-        self._tetrahedra = message
-        self._take_mesh()
-
-    def _take_mesh(self) -> None:
-        if self._rest is None or self._tetrahedra is None:
-            return
-        nodes = vectors_from(self._rest, "patient")
-        self._scanner.attach_mesh(nodes, tetrahedra_from(self._tetrahedra))
-        self._has_mesh = True
+    def _on_mesh(self, topic: str, message: PointCloud2 | Int32MultiArray) -> None:
+        self._mesh[topic] = message
+        if len(self._mesh) == 2:
+            nodes = vectors_from(self._mesh[REST], "patient")
+            self._scanner.attach_mesh(nodes, tetrahedra_from(self._mesh[TETRAHEDRA]))
+            self._has_mesh = True
 
     def _on_pose(self, message: PoseStamped) -> None:
         _remember(self._poses, message, self._pose(message), REMEMBERED)

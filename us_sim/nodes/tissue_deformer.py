@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 from visualization_msgs.msg import MarkerArray
 
-from us_sim.errors import SceneError, SolverError, TrackingError, UsSimError
+from us_sim.errors import SceneError, SolverError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.messages import (
     MarkerShape,
@@ -42,8 +43,6 @@ from us_sim.scene.building import (
 )
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.spelling import format_count
-from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.live_tissue import LiveTissue, TissueMethod
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import Deformation
@@ -66,10 +65,6 @@ class StructureMarkers:
 
     When the first subscriber comes, a thread makes the surfaces; in lockstep the node waits for it.
     Their resolution and rate are the parameters of `StructureMarkersSettings`.
-
-    Args:
-        node: that publishes them, of a scene that has structures.
-        mesh: of its tissue.
     """
 
     def __init__(self, node: SceneNode, mesh: TetrahedralMesh) -> None:
@@ -211,10 +206,7 @@ class TissueDeformer(SceneNode):
             f"preparing {method.solver} for {len(model.mesh.nodes)} nodes, "
             f"{len(model.mesh.tetrahedra)} tetrahedra"
         )
-
-        def constants(materials: Mapping[str, Material]) -> TissueMaterials:
-            return build_materials(scene, materials, model.mesh, volume)
-
+        constants = partial(build_materials, scene, mesh=model.mesh, volume=volume)
         return LiveTissue(model, method, constants, late_progress("preparing the tissue"))
 
     def _prepare(self, values: dict[str, Any]) -> None:
@@ -321,18 +313,19 @@ class TissueDeformer(SceneNode):
             stiffness = self._tissue.solver.compute_contact_stiffness()
         if stiffness is None:
             stiffness = np.zeros((6, 6))
-        try:
-            model = ContactModel(nanoseconds_of(stamp), pose, wrench, stiffness)
-        except TrackingError as error:
-            self.health.count_problem("contact_model", f"{error}; it is not published")
-            return
+        model = ContactModel(nanoseconds_of(stamp), pose, wrench, stiffness)
         self._contact.publish(contact_model_message(model))
         self.health.count_published("tissue/contact_model")
 
     def _describe(self, deformation: Deformation) -> None:
         if deformation.inverted:
-            problem = _inside_out(deformation, self._tissue.solver.name)
-            self.health.count_problem("inside out", problem)
+            tetrahedra = format_count(deformation.inverted, "tetrahedron is", "tetrahedra are")
+            self.health.count_problem(
+                "inside out",
+                f"{tetrahedra} inside out: {self._tissue.solver.name} is not made for a press this "
+                f"deep; fem_nonlinear is (set the parameter solver of tissue_deformer, or "
+                f"tissue.solver in the scene)",
+            )
         self.health.warning = ""
         if not deformation.is_balanced:
             self._unbalanced += 1
@@ -386,15 +379,6 @@ def _method_of(values: Mapping[str, Any]) -> TissueMethod:
     settings = {name: values[f"{name}."] for name in SOLVERS.importable}
     own = values[OWN]
     return TissueMethod(own.solver, own.compare_with or "", settings, materials)
-
-
-def _inside_out(deformation: Deformation, name: str) -> str:
-    count = deformation.inverted
-    sentence = f"{count} {'tetrahedron is' if count == 1 else 'tetrahedra are'} inside out"
-    return (
-        f"{sentence}: {name} is not made for a press this deep; fem_nonlinear is (set the "
-        "parameter solver of tissue_deformer, or tissue.solver in the scene)"
-    )
 
 
 main = node_main(TissueDeformer, __name__)

@@ -25,10 +25,6 @@ class RecordingPlayer(GuardedNode):
 
     If its parameter ``clock`` is set it publishes ``/clock``, and goes by the computer's clock
     itself; else it goes by its node's, also when that is set back.
-
-    Args:
-        name: of the node.
-        settings: its parameters by default.
     """
 
     def __init__(self, name: str, settings: PlayerSettings, **kwargs: Any) -> None:

@@ -65,12 +65,6 @@ class AnnotatedImage:
     that the parameter ``overlay`` chooses. If no pose comes for a while, the last image is sent
     again with a badge, under its own stamp; before the first pose a black one. In lockstep nothing
     ages. Its parameters are those of `AnnotatedImageSettings`.
-
-    Args:
-        node: that publishes it.
-        probe: of the images.
-        label_names: of the volume's labels.
-        streams: some have colours to be laid over the image.
     """
 
     def __init__(
@@ -149,11 +143,9 @@ class AnnotatedImage:
         node, state = self._node, self.state
         node.health.values["probe_pose"] = state
         missing = state in ("stale", "lost")
-        warning = f"the probe's pose is {state}: the image is frozen" if missing else ""
-        if missing and (why := explain_missing_poses(node)):
-            warning = f"{why}: the image is frozen"
-            if not self._missing:
-                node.get_logger().info(f"{warning} until somebody does")
+        why = explain_missing_poses(node) if missing else ""
+        if missing and not self._missing and why:
+            node.get_logger().info(f"{why}: the image is frozen until somebody does")
         elif missing and not self._missing:
             node.health.count_problem(
                 "pose age",
@@ -163,7 +155,8 @@ class AnnotatedImage:
         elif self._missing and state == "live":
             node.get_logger().info("probe poses come again")
         self._missing = missing
-        node.health.warning = warning
+        what = why or f"the probe's pose is {state}"
+        node.health.warning = f"{what}: the image is frozen" if missing else ""
 
     def _badge(self) -> Badge | None:
         state, pose_age, image_age = self.state, self._pose_age.seconds, self._image_age.seconds

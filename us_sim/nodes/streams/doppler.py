@@ -28,10 +28,8 @@ def create_doppler_streams(node: SceneNode, volume: Volume) -> list[FrameStream]
     """Create the streams of blood: velocity, colour Doppler, spectrum; flows are parameters."""
     warm_up()
     blood = build_blood(node.scene, volume)
-    vessels = {
-        f"flow.{name}.": vessel
-        for name, vessel in zip(node.scene.flows, blood.vessels, strict=True)
-    }
+    given = {f"flow.{name}.": flow for name, flow in node.scene.flows.items()}
+    vessels = dict(zip(given, blood.vessels, strict=True))
 
     def require(wanted: dict[str, Any]) -> None:
         for name, settings in wanted.items():
@@ -42,19 +40,12 @@ def create_doppler_streams(node: SceneNode, volume: Volume) -> list[FrameStream]
             if settings != vessels[name].settings:
                 vessels[name].apply_settings(settings)
 
-    given = {f"flow.{name}.": flow for name, flow in node.scene.flows.items()}
     use(LiveSettings(node, given, require, use).values)
     return [*_colour_streams(node, blood), _spectrum_stream(node, blood)]
 
 
 class VesselFollower:
-    """Keeps the parameters ``lateral`` and ``depth`` on a vessel while ``follow`` is set.
-
-    Args:
-        node: that has the parameters.
-        prefix: of the parameters, with its dot.
-        blood: in the vessels.
-    """
+    """Keeps a node's parameters ``lateral`` and ``depth`` on a vessel while ``follow`` is set."""
 
     def __init__(self, node: SceneNode, prefix: str, blood: Blood) -> None:
         self._node, self._prefix, self._blood = node, prefix, blood

@@ -76,12 +76,7 @@ class TrackerNode(SceneNode):
     def read_measurement(
         self, message: PoseStamped, topic: str, frame: str = ""
     ) -> tuple[int, Pose]:
-        """Return a message's stamp, ns, and its pose.
-
-        Args:
-            message: of ``topic``.
-            topic: its name.
-            frame: that it must be in; empty is the scene's.
+        """Return a message's stamp, ns, and its pose in ``frame``, by default the scene's.
 
         Raises:
             FrameError: it is in another frame.
