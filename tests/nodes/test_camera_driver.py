@@ -119,7 +119,7 @@ class PaperCamera:
 
 def test_a_camera_that_comes_and_goes_is_waited_for(bench, monkeypatch, calibration):
     monkeypatch.setattr("us_sim.tracking.camera.source.cv2.VideoCapture", PaperCamera)
-    monkeypatch.setattr("us_sim.nodes.camera_driver.RETRY_S", 0.02)
+    monkeypatch.setattr("us_sim.nodes.device_driver.RETRY_S", 0.02)
     PaperCamera.left = 0
     node = bench.make(CameraDriver, source=7, camera_info=str(calibration))
     images = bench.collect(Image, "camera/image_raw")
