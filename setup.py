@@ -19,6 +19,7 @@ NODES = [
     "nodes.session_recorder",
     "nodes.skin_deformer",
     "nodes.slice_interpolator",
+    "nodes.space_mouse_driver",
     "nodes.tissue_deformer",
     "viewer.viewer",
 ]

@@ -23,6 +23,7 @@ from us_sim.nodes.session_recorder import SessionRecorder
 from us_sim.nodes.settings import NODES
 from us_sim.nodes.skin_deformer import SkinDeformer
 from us_sim.nodes.slice_interpolator import SliceInterpolator
+from us_sim.nodes.space_mouse_driver import SpaceMouseDriver
 from us_sim.nodes.tf import TFMessage
 from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.nodes.topics import TOPICS
@@ -120,6 +121,7 @@ def test_players_drivers_and_writers_do_too(bench, tmp_path):
             displacement=str(tmp_path / "displacement"),
         ),
         bench.make(CameraDriver, source="/dev/no_camera"),
+        bench.make(SpaceMouseDriver),
         bench.make(ProbeRobot),
         bench.add(SessionMonitor(context=bench.context)),
     ]
@@ -151,6 +153,7 @@ def all_nodes(scenes, tmp_path):
             bench.make(SessionRecorder, file=str(tmp_path / "a.mcap"), topics=["/none"]),
             bench.make(OpenIGTLinkBridge, scene=scene, port=0),
             bench.make(CameraDriver, source="/dev/no_camera"),
+            bench.make(SpaceMouseDriver),
             bench.make(ProbeRobot),
             bench.add(SessionMonitor(context=bench.context)),
         ]

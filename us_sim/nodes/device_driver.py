@@ -19,17 +19,17 @@ class DeviceDriver(GuardedNode):
 
     Args:
         name: of the node.
-        device: its word in reports.
+        device: what reports call it.
     """
 
     def __init__(self, name: str, device: str, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
         self._device = device
-        self.closing = threading.Event()
+        self.closing = threading.Event()  # set when nothing more is to be read
         self._thread = threading.Thread(target=self._run, name=device, daemon=True)
 
     def start_reading(self, hardware_id: str) -> None:
-        """Begin, with that name in diagnostics."""
+        """Start the thread, and report the device in diagnostics under its own name."""
         self.health = Health(self, hardware_id)
         self.health.state = "opening"
         self._thread.start()

@@ -373,6 +373,16 @@ class CameraDriverSettings(Settings):
 
 
 @dataclass(frozen=True)
+class SpaceMouseDriverSettings(Settings):
+    """Parameters of ``space_mouse_driver``."""
+
+    frame_id: str = setting(description="frame of the messages", default="spacenav")
+    rate: float = setting(
+        Quantity("frequency", 1.0, 1000.0), "messages while nothing changes", default=100.0
+    )
+
+
+@dataclass(frozen=True)
 class OpenIGTLinkBridgeSettings(Settings):
     """Parameters of ``openigtlink_bridge``."""
 
@@ -434,6 +444,7 @@ NODES: dict[str, tuple[type[Settings], ...]] = {
     "session_recorder": (SessionRecorderSettings,),
     "session_control": (SessionControlSettings,),
     "camera_driver": (CameraDriverSettings,),
+    "space_mouse_driver": (SpaceMouseDriverSettings,),
     "probe_robot": (RobotSettings,),
     "image_writer": (ImageWriterSettings,),
     "viewer": (ViewerSettings,),

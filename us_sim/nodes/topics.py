@@ -29,7 +29,7 @@ class Topic:
     @property
     def is_from_drivers(self) -> bool:
         """True if it comes from outside this package, or from a node in place of a driver."""
-        stand_ins = {"path_player", "camera_driver", "probe_robot", "viewer"}
+        stand_ins = {"path_player", "camera_driver", "space_mouse_driver", "probe_robot", "viewer"}
         return set(self.publishers) <= stand_ins
 
 
