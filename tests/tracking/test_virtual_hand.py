@@ -68,7 +68,7 @@ FACET = RADIUS * (1 - math.cos(math.radians(1)))  # how deep a facet of 2 degree
 @given(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
 def test_on_a_plane_the_foot_is_straight_below(x, y, z):
     foot = PLANE.find_closest(np.array([x, y, z]))
-    np.testing.assert_allclose(foot.point, [x, y, 0.0], atol=1e-15)
+    np.testing.assert_allclose(foot.point, [x, y, 0.0], atol=1e-12)
     np.testing.assert_allclose(foot.normal, [0.0, 0.0, -1.0])
 
 
