@@ -45,7 +45,7 @@ def test_the_five_plain_metrics_come_first():
         Metric("Time above 20 N", "s", 0.25),
     ]
     score = Score(metrics, [Step("a", True, ""), Step("b", False, "")], (), 52.21)
-    assert [(each.label, each.brief) for each in select_plain_metrics(score, 20.0)] == [
+    assert [(each.label, each.format(3)) for each in select_plain_metrics(score, 20.0)] == [
         ("Time, s", "52.2"),
         ("Highest force, N", "9.88"),
         ("Time above 20 N, s", "0.25"),

@@ -79,7 +79,7 @@ def _score(args: argparse.Namespace) -> int:
     _require_new(out, _FILES)
     scan = read_scan(args.session, args.topic, args.wrench, late_progress("score"))
     metrics = list(compute_metrics(scan, settings))
-    rows = [(each.name, each.text, each.unit, each.roles) for each in metrics]
+    rows = [(each.name, each.format(), each.unit, each.roles) for each in metrics]
     table = format_markdown_table(("metric", "value", "unit", "roles"), rows)
     missing = [f"left out: {sentence}" for sentence in scan.missing]
     steps = exercise.evaluate_scan(scan) if exercise is not None else []
@@ -88,7 +88,7 @@ def _score(args: argparse.Namespace) -> int:
     if out is None:
         return 0
     out.mkdir(parents=True, exist_ok=True)
-    values = [(each.name, each.roles, each.unit, each.text) for each in metrics]
+    values = [(each.name, each.roles, each.unit, each.format()) for each in metrics]
     pd.DataFrame(values, columns=_HEAD).to_csv(out / "score.csv", index=False)
     draw_score(out / "score.png", args.session.name, scan, steps)
     page = [

@@ -200,10 +200,12 @@ class Scorer(SceneNode):
             "state": classify_attempt(score, self._void),
             "seconds": score.seconds,
             "about": about,
-            "plain": {each.label: each.brief for each in plain},
+            "plain": {each.label: each.format(3) for each in plain},
             "steps": [step.to_document() for step in score.steps],
             "faults": faults,
-            "metrics": {} if self._is_hidden(score) else {m.label: m.text for m in score.metrics},
+            "metrics": {}
+            if self._is_hidden(score)
+            else {m.label: m.format() for m in score.metrics},
         }
 
     def _is_hidden(self, score: Score) -> bool:

@@ -22,7 +22,6 @@ from us_sim.scoring.settings import CONTACT_FORCE, ScoreSettings
 _Array = NDArray[np.float64]
 _MM, _MM2, _DEGREES = 1e3, 1e6, float(np.rad2deg(1.0))
 
-
 DEFINITIONS = {
     "Elapsed Time": "from the first pose to the last",
     "Path Length": "sum of the steps between poses",
@@ -52,17 +51,8 @@ class Metric:
         """Name, the structure that it is of, and unit."""
         return f"{self.name}{self.structure and f' of {self.structure}'}, {self.unit}"
 
-    @property
-    def text(self) -> str:
-        """The value as a program reads it; - where it is not known."""
-        return self._format(6)
-
-    @property
-    def brief(self) -> str:
-        """The value as a person reads it, in three digits."""
-        return self._format(3)
-
-    def _format(self, digits: int) -> str:
+    def format(self, digits: int = 6) -> str:
+        """Return the value as a program reads it, a person in 3 digits; - where it is not known."""
         return f"{self.value:.{digits}g}" if np.isfinite(self.value) else "-"
 
 
@@ -138,50 +128,45 @@ class Tally:
     def __init__(self, settings: ScoreSettings | None = None) -> None:
         self._settings = settings or ScoreSettings()
         self._sums: defaultdict[str, float] = defaultdict(float)
-        self._extremes: defaultdict[str, float] = defaultdict(float)
-        self._vessels: dict[str, Tally] = {}
+        self._fastest = self._strongest = 0.0  # m/s and N
+        self._vessels: defaultdict[str, _VesselTally] = defaultdict(_VesselTally)
 
     def add_scan(self, scan: Scan) -> Tally:
         """Add the samples that are new."""
-        self._add_motion(scan)
-        if scan.force is not None:
-            self._add_force(scan, scan.force)
-        for name, section in scan.sections.items():
-            self._vessels.setdefault(name, Tally())._add_section(scan, section)
-        return self
-
-    def list_metrics(self) -> Iterator[Metric]:
-        """Yield all metrics that there are data for, in the order of a report."""
-        yield from self._list_motion()
-        if "contact" in self._sums:
-            yield from self._list_force()
-        for name, tally in self._vessels.items():
-            yield from tally._list_section(name)
-
-    def _sum(self, **values: Any) -> None:
-        for name, value in values.items():
-            self._sums[name] += float(value)
-
-    def _peak(self, name: str, values: _Array) -> None:
-        """Keep the largest; none is below 0."""
-        self._extremes[name] = max(self._extremes[name], float(values.max(initial=0.0)))
-
-    def _add_motion(self, scan: Scan) -> None:
         motion = scan.motion
         steps, speeds, turns = scan.select_new(
             motion.times, motion.steps, motion.speeds, motion.angular_speeds
         )
-        self._sum(steps=len(steps), time=steps.sum(), path=speeds @ steps, turn=turns @ steps)
-        self._sum(speed=speeds.sum())
-        self._peak("speed", speeds)
+        self._sum(steps=len(steps), time=steps.sum(), speed=speeds.sum())
+        self._sum(path=speeds @ steps, turn=turns @ steps)
+        self._fastest = max(self._fastest, float(speeds.max(initial=0.0)))
+        if scan.force is not None:
+            self._add_force(scan, scan.force)
+        for name, section in scan.sections.items():
+            self._vessels[name].add_section(scan, section)
+        return self
 
-    def _list_motion(self) -> Iterator[Metric]:
+    def list_metrics(self) -> Iterator[Metric]:
+        """Yield all metrics that there are data for, in the order of a report."""
         total = self._sums
         yield Metric("Elapsed Time", "s", total["time"])
         yield Metric("Path Length", "mm", _MM * total["path"])
         yield Metric("Rotation Total", "deg", _DEGREES * total["turn"])
         yield Metric("Average Velocity", "mm/s", _MM * total["speed"] / total["steps"])
-        yield Metric("Peak Velocity", "mm/s", _MM * self._extremes["speed"])
+        yield Metric("Peak Velocity", "mm/s", _MM * self._fastest)
+        if "contact" in total:
+            yield Metric("Time in Contact", "s", total["contact"])
+            if total["contact"] > 0:
+                mean = total["pressed"] / total["contact"]
+                yield Metric("Mean Probe Force in Contact", "N", mean)
+            yield Metric("Peak Probe Force", "N", self._strongest)
+            yield Metric(f"Time above {self._settings.force_limit:g} N", "s", total["above"])
+        for name, vessel in self._vessels.items():
+            yield from vessel.list_metrics(name)
+
+    def _sum(self, **values: Any) -> None:
+        for name, value in values.items():
+            self._sums[name] += float(value)
 
     def _add_force(self, scan: Scan, force: Force) -> None:
         """Add steps between two samples; a step counts as being in contact where its end is."""
@@ -194,29 +179,26 @@ class Tally:
         touching = ends >= CONTACT_FORCE
         self._sum(contact=steps[touching].sum(), pressed=during[touching] @ steps[touching])
         self._sum(above=steps[ends > self._settings.force_limit].sum())
-        self._peak("force", force.newtons)
+        self._strongest = max(self._strongest, float(force.newtons.max()))
 
-    def _list_force(self) -> Iterator[Metric]:
-        total = self._sums
-        yield Metric("Time in Contact", "s", total["contact"])
-        if total["contact"] > 0:
-            mean = total["pressed"] / total["contact"]
-            yield Metric("Mean Probe Force in Contact", "N", mean)
-        yield Metric("Peak Probe Force", "N", self._extremes["force"])
-        yield Metric(f"Time above {self._settings.force_limit:g} N", "s", total["above"])
 
-    def _add_section(self, scan: Scan, section: VesselSection) -> None:
+class _VesselTally:
+    """Areas of a vessel, of images in which they are known at rest, too."""
+
+    def __init__(self) -> None:
+        self._count, self._rest = 0, 0.0  # images, and the sum of their areas (m²) at rest
+        self._area = self._part = np.inf  # m², the smallest, and of the area at rest
+
+    def add_section(self, scan: Scan, section: VesselSection) -> None:
         area, rest = scan.select_new(section.times, section.area, section.at_rest)
         known = np.isfinite(area / rest)
-        self._sum(known=known.sum(), rest=rest[known].sum())
-        for name, values in (("area", area[known]), ("part", (area / rest)[known])):
-            self._extremes[name] = min(self._extremes.get(name, np.inf), values.min(initial=np.inf))
+        area, rest = area[known], rest[known]
+        self._count, self._rest = self._count + len(rest), self._rest + float(rest.sum())
+        self._area = min(self._area, area.min(initial=np.inf))
+        self._part = min(self._part, (area / rest).min(initial=np.inf))
 
-    def _list_section(self, name: str) -> Iterator[Metric]:
-        total = self._sums
-        if not total["known"]:
-            return
-        mean = total["rest"] / total["known"]
-        yield Metric("Mean Area at Rest", "mm^2", _MM2 * mean, name)
-        yield Metric("Smallest Area", "mm^2", _MM2 * self._extremes["area"], name)
-        yield Metric("Smallest Part of the Area at Rest", "%", 100 * self._extremes["part"], name)
+    def list_metrics(self, name: str) -> Iterator[Metric]:
+        if self._count:
+            yield Metric("Mean Area at Rest", "mm^2", _MM2 * (self._rest / self._count), name)
+            yield Metric("Smallest Area", "mm^2", _MM2 * self._area, name)
+            yield Metric("Smallest Part of the Area at Rest", "%", 100 * self._part, name)
