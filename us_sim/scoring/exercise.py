@@ -26,6 +26,7 @@ from us_sim.settings.spelling import describe_unknown
 from us_sim.settings.text_files import read_yaml
 from us_sim.share import shared_roots
 
+_Array = NDArray[np.float64]
 _TIME, _FORCE = Quantity("time", 0.1, 3600.0), Quantity("force", 0.01, 200.0)
 _MM = 1e3
 _MOVED = 1e-3  # m, by which a hand has moved the probe
@@ -38,15 +39,14 @@ class Step(NamedTuple):
     is_done: bool
     seen: str
     # (P, 3) m in frame ``patient``, the place of it: one point, or those of a line
-    target: NDArray[np.float64] | None = None
+    target: _Array | None = None
     is_missed: bool = False  # it was tried in vain, and the probe has moved on
 
     def to_document(self) -> dict[str, Any]:
         """Return it as JSON, with its ``state``: done, missed, or to do."""
         state = "done" if self.is_done else "missed" if self.is_missed else "to do"
-        document = {"what": self.what, "state": state, "seen": self.seen}
         target = {} if self.target is None else {"target": self.target.round(4).tolist()}
-        return document | target
+        return {"what": self.what, "state": state, "seen": self.seen, **target}
 
 
 class Fault(NamedTuple):
@@ -64,17 +64,13 @@ class Attempt(ABC):
     since nobody knows when it touches.
     """
 
-    is_blind = False
-    """True if steps say only what an image shows, until the attempt has ended."""
-    touched: float | None = None
-    """s since the first pose, when the probe touched the skin for the first time."""
-    ended: float | None = None
-    """s, when all was done or the time was over; None before."""
-    faults: Sequence[Fault] = ()
-    """Everything that was done wrong, in order."""
+    is_blind = False  # steps say only what an image shows, until the attempt has ended
+    touched: float | None = None  # s since the first pose, of the first touch of the skin
+    ended: float | None = None  # s, when all was done or the time was over; None before
+    faults: Sequence[Fault] = ()  # everything that was done wrong, in order
     _has_begun = False
-    _air: tuple[float, NDArray[np.float64]] | None = None
-    """s and (3,) m: since when, and from where, the probe is in the air."""
+    # s and (3,) m: since when, and from where, the probe is in the air
+    _air: tuple[float, _Array] | None = None
     _time = 0.0  # s, of the last pose
 
     @property
@@ -100,7 +96,7 @@ class Attempt(ABC):
         return scan
 
     def _find_begin(
-        self, scan: Scan, times: NDArray[np.float64], is_touching: NDArray[np.bool_]
+        self, scan: Scan, times: _Array, is_touching: NDArray[np.bool_]
     ) -> float | None:
         """Return since when the probe was in the air from where a hand has moved it.
 
@@ -140,9 +136,8 @@ class Attempt(ABC):
 
     def compute_duration(self) -> float | None:
         """Return the s from the first touch to the end, or so far; None before the first."""
-        if self.touched is None:
-            return None
-        return (self._time if self.ended is None else self.ended) - self.touched
+        end = self._time if self.ended is None else self.ended
+        return None if self.touched is None else end - self.touched
 
 
 class Task(Settings):
@@ -150,42 +145,17 @@ class Task(Settings):
 
     error: ClassVar = ScoreError
     section: ClassVar = "task"
-    asks: ClassVar[bool] = False
-    """It has questions that a learner can answer, where nothing is told."""
+    asks: ClassVar[bool] = False  # it has questions that a learner can answer, if nothing is told
 
     @property
     def structures(self) -> tuple[str, ...]:
         """Names of the vessels that the scene must have."""
-        return ()
+        named = [vars(self).get(key) for key in ("structure", "artery")]
+        return tuple(name for name in named if name)
 
     @abstractmethod
     def begin_attempt(self, lines: Mapping[str, CentreLine]) -> Attempt:
         """Return an attempt at it, in a scene with these vessels."""
-
-
-class _Holding(Attempt):
-    """An attempt to hold something without a break, which ends when it was held long enough."""
-
-    def __init__(self, duration: float) -> None:
-        self._duration = duration  # s
-        self._longest = self._held = 0.0  # s
-        self._last, self._was = 0.0, False
-
-    def _hold(self, times: NDArray[np.float64], within: NDArray[np.bool_]) -> None:
-        """Add samples: their times (K,) s, and whether it was held at each."""
-        for time, now in zip(times.tolist(), within.tolist(), strict=True):
-            self._held = self._held + time - self._last if now and self._was else 0.0
-            self._longest = max(self._longest, self._held)
-            if self.ended is None and self._longest >= self._duration:
-                self.ended = time
-            self._last, self._was = time, now
-
-    def _step(self, what: str) -> Step:
-        """Return the step, with how long it is held now and was at most."""
-        seen = f"held for {self._longest:.1f} s"
-        if self.ended is None and self._held < self._longest:
-            seen = f"held for {self._held:.1f} s, {self._longest:.1f} s at most"
-        return Step(what, self.ended is not None, seen)
 
 
 @dataclass(frozen=True)
@@ -201,29 +171,6 @@ class KeepForce(Task):
         return _KeptForce(self)
 
 
-class _KeptForce(_Holding):
-    def __init__(self, task: KeepForce) -> None:
-        super().__init__(task.duration)
-        self._task = task
-        self._newtons: float | None = None  # the last
-
-    def add_samples(self, scan: Scan) -> None:
-        if scan.force is not None:
-            new = scan.force.times > scan.since
-            within = np.abs(scan.force.newtons - self._task.force) <= self._task.tolerance
-            self._hold(scan.force.times[new], within[new])
-            self._newtons = float(scan.force.newtons[-1])
-
-    def list_steps(self) -> list[Step]:
-        task = self._task
-        what = f"{task.force:g} ± {task.tolerance:g} N for {task.duration:g} s"
-        if self._newtons is None:
-            return [Step(what, False, "no force yet")]
-        step = self._step(what)
-        now = "" if step.is_done else f"{self._newtons:.1f} N now; "
-        return [step._replace(seen=now + step.seen)]
-
-
 @dataclass(frozen=True)
 class Centre(Task):
     """Bring a vessel to the middle of the image and hold it there."""
@@ -234,38 +181,79 @@ class Centre(Task):
     )
     duration: float = setting(_TIME, "without losing it", default=3.0)
 
-    @property
-    def structures(self) -> tuple[str, ...]:
-        """The vessel."""
-        return (self.structure,)
-
     def begin_attempt(self, lines: Mapping[str, CentreLine]) -> Attempt:
         """Return an attempt with one step."""
         return _Centred(self, lines[self.structure])
 
 
-class _Centred(_Holding):
-    def __init__(self, task: Centre, line: CentreLine) -> None:
-        super().__init__(task.duration)
-        self._task, self._line, self._is_seen = task, line, False
+class _Holding(Attempt):
+    """An attempt to hold something without a break, which ends when it was held long enough."""
+
+    _longest = _held = 0.0  # s
+    _last, _was = 0.0, False  # s, of the last sample, and whether it was held at it
+
+    def _hold(self, times: _Array, within: NDArray[np.bool_], duration: float) -> None:
+        """Add samples: their times (K,) s, and whether it was held at each."""
+        for time, now in zip(times.tolist(), within.tolist(), strict=True):
+            self._held = self._held + time - self._last if now and self._was else 0.0
+            self._longest = max(self._longest, self._held)
+            if self.ended is None and self._longest >= duration:
+                self.ended = time
+            self._last, self._was = time, now
+
+    def _step(self, what: str, now: str = "", target: _Array | None = None) -> Step:
+        """Return the step, with how it is now, and how long it is held now and was at most."""
+        is_done, seen = self.ended is not None, f"held for {self._longest:.1f} s"
+        if not is_done and self._held < self._longest:
+            seen = f"held for {self._held:.1f} s, {self._longest:.1f} s at most"
+        return Step(what, is_done, seen if is_done else now + seen, target)
+
+
+class _KeptForce(_Holding):
+    _newtons: float | None = None  # the last
+
+    def __init__(self, task: KeepForce) -> None:
+        self._task = task
 
     def add_samples(self, scan: Scan) -> None:
-        section = scan.sections.get(self._task.structure)
+        task, force = self._task, scan.force
+        if force is not None:
+            new = force.times > scan.since
+            within = np.abs(force.newtons - task.force) <= task.tolerance
+            self._hold(force.times[new], within[new], task.duration)
+            self._newtons = float(force.newtons[-1])
+
+    def list_steps(self) -> list[Step]:
+        task = self._task
+        what = f"{task.force:g} ± {task.tolerance:g} N for {task.duration:g} s"
+        if self._newtons is None:
+            return [Step(what, False, "no force yet")]
+        return [self._step(what, f"{self._newtons:.1f} N now; ")]
+
+
+class _Centred(_Holding):
+    _is_seen = False
+
+    def __init__(self, task: Centre, line: CentreLine) -> None:
+        self._task, self._line = task, line
+
+    def add_samples(self, scan: Scan) -> None:
+        task, section = self._task, scan.sections.get(self._task.structure)
         if section is not None:
             new = section.times > scan.since
             self._is_seen |= bool(np.isfinite(section.fraction[new]).any())
-            within = np.abs(section.lateral[new]) <= self._task.offset
+            within = np.abs(section.lateral[new]) <= task.offset
             if scan.force is not None:
                 newtons = np.interp(section.times[new], scan.force.times, scan.force.newtons)
                 within &= newtons >= CONTACT_FORCE
-            self._hold(section.times[new], within)
+            self._hold(section.times[new], within, task.duration)
 
     def list_steps(self) -> list[Step]:
         task, points = self._task, self._line.points
         what = f"{task.structure} within {_MM * task.offset:g} mm for {task.duration:g} s"
         if not self._is_seen:
             return [Step(what, False, "never in the image", points)]
-        return [self._step(what)._replace(target=points)]
+        return [self._step(what, target=points)]
 
 
 @dataclass(frozen=True)
@@ -330,11 +318,7 @@ class Exercise(Settings):
         return attempt
 
     def evaluate_scan(self, scan: Scan) -> list[Step]:
-        """Return the steps of the task, with what was seen of each in a whole scan.
-
-        Raises:
-            ScoreError: as `begin_attempt`.
-        """
+        """Return the steps of the task in a whole scan, as of an attempt that is begun with it."""
         attempt = self.begin_attempt(scan.lines)
         attempt.add_scan(scan)
         return attempt.list_steps()
