@@ -7,7 +7,7 @@ and was let go. A thrombus keeps a vein from closing: there it is enough to have
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -64,11 +64,6 @@ class Compression(Task):
         Quantity("time", 1.0, 36000.0), "from the first touch to the last point", default=None
     )
 
-    @property
-    def structures(self) -> tuple[str, ...]:
-        """The vein, and the artery where one is named."""
-        return (self.structure, *([self.artery] if self.artery else []))
-
     def check(self) -> None:
         """Refuse a task without a point."""
         if self.points in ((), 0):
@@ -90,9 +85,8 @@ class Compression(Task):
         room = max(length - 2 * _MARGIN, 0.0)
         count = self.points or int(room / _SPACING + 1e-9) + 1
         spacing = _SPACING if self.points is None else room / max(count - 1, 1)
-        return np.asarray(
-            0.5 * length + spacing * (np.arange(count) - 0.5 * (count - 1)), np.float64
-        )
+        steps = np.arange(count) - 0.5 * (count - 1)
+        return np.asarray(0.5 * length + spacing * steps, np.float64)
 
     def begin_attempt(self, lines: Mapping[str, CentreLine]) -> Attempt:
         """Return an attempt with a step for each point, and one for the time if it is limited."""
@@ -110,8 +104,7 @@ class _Look(NamedTuple):
     force: float  # N; NaN without force
     peak: float  # N, the most since the image before
     artery: float  # part of the artery's area at rest; 1 where nobody knows
-    place: NDArray[np.float64]  # (3,) m, of the probe
-    orientation: NDArray[np.float64]  # (4,) quaternion of it, of length 1
+    pose: Pose  # of the probe
 
     @property
     def is_touching(self) -> bool:
@@ -147,30 +140,28 @@ class _Press:
     force: float = np.nan  # N then
     most: float = 0.0  # N
     closed: tuple[float, float] | None = None  # N, and the part of the artery that was open
-    _closed_since: float | None = field(default=None, repr=False)  # s
+    closed_since: float = np.inf  # s
 
     def add_look(self, look: _Look) -> None:
         """Add an image of it."""
         self.most = max(self.most, float(np.nan_to_num(look.peak)))
         if look.part < self.least:
             self.least, self.force = look.part, look.force
-        if not look.part <= WALLS_TOUCH:
-            self._closed_since = None
-            return
-        if self._closed_since is None:
-            self._closed_since = look.time
+        is_closed = look.part <= WALLS_TOUCH
+        self.closed_since = min(self.closed_since, look.time) if is_closed else np.inf
         is_better = self.closed is None or self.closed[1] < _OPEN <= look.artery
-        if look.time - self._closed_since >= _LOOKED and is_better:
+        if look.time - self.closed_since >= _LOOKED and is_better:
             self.closed = look.force, look.artery
+
+    def describe(self) -> str:
+        """Return words for what was seen of the vein."""
+        if self.closed is not None:
+            return f"closed{_format_force(self.closed[0])}"
+        return f"{100 * self.least:.0f} % open{_format_force(self.force)}"
 
 
 class _Examination(Attempt):
-    """All presses of an attempt, in the order of its images.
-
-    Args:
-        task: with the limits.
-        points: of the vein.
-    """
+    """All presses of an attempt, in the order of its images."""
 
     def __init__(self, task: Compression, points: list[_Point]) -> None:
         self._task, self._points = task, points
@@ -205,77 +196,84 @@ class _Examination(Attempt):
 
     def add_samples(self, scan: Scan) -> None:
         """Add the images that are new."""
-        task = self._task
+        task, force = self._task, scan.force
         self._thrombus = scan.thrombi.get(task.structure, self._thrombus)
-        section, artery = (scan.sections.get(name or "") for name in (task.structure, task.artery))
-        if section is None:
+        vein, artery = (scan.sections.get(name or "") for name in (task.structure, task.artery))
+        if vein is None:
             return
-        force = (
-            scan.force.interpolate_at(section.times)
-            if scan.force
-            else np.full(len(section.times), np.nan)
-        )
-        places = scan.motion.interpolate_positions(section.times)
-        orientations = scan.motion.find_orientations(section.times)
-        for k in np.flatnonzero(section.times > scan.since).tolist():
-            time, peak = float(section.times[k]), float(force[k])
+        unknown = np.full(len(vein.times), np.nan)
+        newtons = unknown if force is None else force.interpolate_at(vein.times)
+        beside = np.nan_to_num(unknown if artery is None else artery.fraction, nan=1.0)
+        rows = np.stack([vein.times, vein.along, vein.fraction, newtons, beside], axis=1)
+        poses = scan.motion.sample_poses(vein.times)
+        for k in np.flatnonzero(vein.times > scan.since):
+            time, along, part, newton, left = rows[k].tolist()
             if self.ended is not None and time > self.ended:
                 return
-            if scan.force is not None:
-                times = scan.force.times
-                between = scan.force.newtons[(times > self._looked) & (times <= time)]
-                peak = float(between.max(initial=np.nan_to_num(peak)))
-            part_of_artery = 1.0 if artery is None else np.nan_to_num(artery.fraction[k], nan=1.0)
-            along, part = float(section.along[k]), float(section.fraction[k])
-            place, orientation = places[k], orientations[k]
-            artery_part = float(part_of_artery)
-            self._look(
-                _Look(time, along, part, float(force[k]), peak, artery_part, place, orientation)
-            )
+            peak = newton
+            if force is not None:
+                between = force.newtons[(force.times > self._looked) & (force.times <= time)]
+                peak = float(between.max(initial=np.nan_to_num(newton)))
+            self._look(_Look(time, along, part, newton, peak, left, poses[k]))
             self._looked = time
 
     def list_steps(self) -> list[Step]:
         """Return one step for each point, and one for the time if it is limited."""
         pressed = self._find_pressed()
-        steps = []
-        for number, point in enumerate(self._points, 1):
-            what = f"{number}: {self._task.structure} at {_MM * point.at:.0f} mm"
-            if self.is_blind:
-                steps.append(self._hidden_step(f"point {number}", point))
-                continue
-            is_here = abs(self._along - point.at) <= _TOLERANCE
-            seen = point.seen if point.is_done else self._describe_point(point, point is pressed)
-            is_missed = point.most is not None and not (point.is_done or is_here)
-            steps.append(Step(what, point.is_done, seen, point.place[None], is_missed=is_missed))
+        make_step = self._hidden_step if self.is_blind else self._step
+        steps = [make_step(k, each, each is pressed) for k, each in enumerate(self._points, 1)]
         if self.is_blind:
             steps.append(self._thrombus_step())
-        return [*steps, *self._steps_of_time()]
+        limit, seconds = self._task.time_limit, self.compute_duration() or 0.0
+        if limit is not None:
+            what, seen = f"within {limit:g} s", f"{seconds:.0f} s"
+            steps.append(self._conclude(what, seconds <= limit, seen))
+        return steps
 
-    def _hidden_step(self, what: str, point: _Point) -> Step:
+    def _conclude(
+        self, what: str, is_right: bool, seen: str, target: NDArray[np.float64] | None = None
+    ) -> Step:
+        """Return a step that is neither done nor missed before the attempt has ended."""
+        has_ended = self.ended is not None
+        return Step(what, has_ended and is_right, seen, target, has_ended and not is_right)
+
+    def _step(self, number: int, point: _Point, is_pressed: bool) -> Step:
+        """Return the step of a point: what goes on there, or was seen."""
+        press, is_here, seen = self._press, abs(self._along - point.at) <= _TOLERANCE, point.seen
+        if press is not None and not point.is_done:
+            advice = "press harder" if press.closed is None and press.most < _ENOUGH else "let go"
+            if is_pressed or (is_here and press.problem):
+                seen = press.problem or f"{press.describe()}: {advice}"
+        elif not point.is_done and is_here and self._is_seen_open(self._along):
+            seen = "seen open: press"
+        is_missed = point.most is not None and not (point.is_done or is_here)
+        what = f"{number}: {self._task.structure} at {_MM * point.at:.0f} mm"
+        return Step(what, point.is_done, seen, point.place[None], is_missed)
+
+    def _hidden_step(self, number: int, point: _Point, is_pressed: bool) -> Step:
         """Return the step of a point on which the learner answers."""
-        most = self._press.most if self._press and self._find_pressed() is point else point.most
+        most = self._press.most if self._press is not None and is_pressed else point.most
         pressed = "not pressed" if most is None else f"pressed with {most:.1f} N"
         seen = f"{pressed}, {point.answer or 'no answer yet'}"
-        if self.ended is None:
-            return Step(what, False, seen, point.place[None])
         truths = self._truths(point)
-        is_right = point.answer in truths and point.is_examined
-        if point.answer not in truths:
+        is_right = point.answer in truths
+        if self.ended is not None and not is_right:
             seen = f"{seen}: it is {' or '.join(truths)}"
-        elif not is_right:
+        elif self.ended is not None and not point.is_examined:
             seen = f"{seen}: right, and not examined: {point.seen}"
-        return Step(what, is_right, seen, point.place[None], is_missed=not is_right)
+        is_right &= point.is_examined
+        return self._conclude(f"point {number}", is_right, seen, point.place[None])
 
     def _thrombus_step(self) -> Step:
         seen = f"at point {self._answer}" if self._answer.isdigit() else self._answer
-        if self.ended is None:
-            return Step("thrombus", False, seen or "no answer yet")
         truths = enumerate(map(self._truths, self._points), 1)
         where = [str(number) for number, each in truths if ANSWERS[1] in each]
         is_right = self._answer in (where or [NO_THROMBUS])
-        if not is_right:
+        if self.ended is None:
+            seen = seen or "no answer yet"
+        elif not is_right:
             seen = f"{seen}: {f'it is at point {where[0]}' if where else 'there is none'}"
-        return Step("thrombus", is_right, seen, is_missed=not is_right)
+        return self._conclude("thrombus", is_right, seen)
 
     def _truths(self, point: _Point) -> tuple[str, ...]:
         """Return the right answers on a point; both are right within 3 mm of a thrombus' end."""
@@ -284,16 +282,6 @@ class _Examination(Attempt):
         if abs(inside) <= _EDGE:
             return not_compressible, compressible
         return (not_compressible,) if inside > 0 else (compressible,)
-
-    def _steps_of_time(self) -> list[Step]:
-        limit = self._task.time_limit
-        if limit is None:
-            return []
-        seconds = self.compute_duration() or 0.0
-        is_kept, is_over = seconds <= limit, self.ended is not None
-        is_missed = is_over and not is_kept
-        is_done, seen = is_over and is_kept, f"{seconds:.0f} s"
-        return [Step(f"within {limit:g} s", is_done, seen, is_missed=is_missed)]
 
     def _look(self, look: _Look) -> None:
         task = self._task
@@ -334,25 +322,23 @@ class _Examination(Attempt):
 
     def _is_seen_open(self, along: float) -> bool:
         """Return whether the vein has been seen open there for long enough."""
-        if self._open is None:
-            return False
-        since, where = self._open
+        since, where = self._open or (np.inf, np.nan)
         return abs(along - where) <= _TOLERANCE and self._looked - since >= _LOOKED
 
     def _check_place(self, look: _Look, press: _Press) -> None:
         """Void a press that slides over the skin or turns."""
-        begin = press.begin
-        at_begin = Pose(begin.place, begin.orientation)
-        moved = at_begin.inverse().transform_points(look.place[None])[0]
-        slid = float(np.hypot(moved[0], moved[1]))
-        turned = 2.0 * np.arccos(min(abs(float(look.orientation @ begin.orientation)), 1.0))
+        moved = press.begin.pose.inverse() @ look.pose
+        slid = float(np.hypot(*moved.position[:2]))
+        turned = 2.0 * np.arccos(min(abs(moved.orientation[3]), 1.0))
         if press.has_slid or not look.is_touching or (slid <= _TOLERANCE and turned <= _TURN):
             return
         press.has_slid = True
-        how = f"turned {np.rad2deg(turned):.0f}°"
-        if slid > _TOLERANCE:
-            how = f"slid {_MM * slid:.0f} mm"
-        press.problem = f"{how} under pressure: let go before you move on"
+        far = (
+            f"slid {_MM * slid:.0f} mm"
+            if slid > _TOLERANCE
+            else f"turned {np.rad2deg(turned):.0f}°"
+        )
+        press.problem = f"{far} under pressure: let go before you move on"
         self.faults.append(Fault(look.time, press.problem))
 
     def _check_force(self, look: _Look) -> None:
@@ -368,9 +354,7 @@ class _Examination(Attempt):
 
     def _find_pressed(self) -> _Point | None:
         """Return the point that the press is at."""
-        if self._press is None:
-            return None
-        along = self._press.begin.along
+        along = np.nan if self._press is None else self._press.begin.along
         nearest = min(self._points, key=lambda point: abs(point.at - along))
         return nearest if abs(nearest.at - along) <= _TOLERANCE else None
 
@@ -387,18 +371,14 @@ class _Examination(Attempt):
 
     def _judge(self, press: _Press, point: _Point) -> tuple[bool, str]:
         """Return whether the point is done, and words for what was seen."""
+        seen = press.describe()
         if press.problem:
             return False, press.problem
         if press.closed is not None:
-            force, artery = press.closed
-            is_open = artery >= _OPEN
-            also = (
-                ""
-                if is_open
-                else f", and of the {self._task.artery} {100 * artery:.0f} % were left"
-            )
-            return is_open, f"closed{_format_force(force)}{also}"
-        seen = f"{100 * press.least:.0f} % open{_format_force(press.force)}"
+            left = press.closed[1]
+            if left >= _OPEN:
+                return True, seen
+            return False, f"{seen}, and of the {self._task.artery} {100 * left:.0f} % were left"
         if press.least <= WALLS_TOUCH:
             return False, f"closed{_format_force(press.force)} too shortly to be seen"
         if press.most < _ENOUGH:
@@ -406,23 +386,6 @@ class _Examination(Attempt):
         begin, end = self._thrombus
         is_thrombus = begin - _TOLERANCE <= point.at <= end + _TOLERANCE
         return is_thrombus, f"{seen}: {'a thrombus' if is_thrombus else 'not closed'}"
-
-    def _describe_point(self, point: _Point, is_pressed: bool) -> str:
-        """Return words for a point that is to be done: what goes on there, or was seen."""
-        press, is_here = self._press, abs(self._along - point.at) <= _TOLERANCE
-        if press is not None and (is_pressed or (is_here and press.problem)):
-            return press.problem or self._describe_press(press)
-        if press is None and is_here and self._is_seen_open(self._along):
-            return "seen open: press"
-        return point.seen
-
-    @staticmethod
-    def _describe_press(press: _Press) -> str:
-        """Return words for the press that goes on."""
-        if press.closed is not None:
-            return f"closed{_format_force(press.closed[0])}: let go"
-        seen = f"{100 * press.least:.0f} % open{_format_force(press.force)}"
-        return f"{seen}: {'press harder' if press.most < _ENOUGH else 'let go'}"
 
 
 def _format_force(force: float) -> str:

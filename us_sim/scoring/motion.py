@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import ScoreError
+from us_sim.geometry.pose import Pose
 
 _Array = NDArray[np.float64]
 
@@ -61,10 +62,10 @@ class Motion:
         axes = [np.interp(times, self.times, axis) for axis in self.positions.T]
         return np.stack(axes, axis=1)
 
-    def find_orientations(self, times: _Array) -> _Array:
-        """Return the orientations (N, 4) of the last samples before times (N,) s."""
-        last = np.searchsorted(self.times, times, side="right") - 1
-        return np.asarray(self.orientations[np.maximum(last, 0)])
+    def sample_poses(self, times: _Array) -> list[Pose]:
+        """Return poses at times (N,) s, turned as the last sample before each."""
+        last = np.maximum(np.searchsorted(self.times, times, side="right") - 1, 0)
+        return [*map(Pose, self.interpolate_positions(times), self.orientations[last])]
 
     @cached_property
     def steps(self) -> _Array:
