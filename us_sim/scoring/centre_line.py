@@ -85,12 +85,13 @@ class CentreLine:
         """
         seen = pose.inverse().transform_points(self.points)
         across = seen[:, 1]
-        nearest, cut = np.inf, None
-        for k in np.flatnonzero(across[1:] * across[:-1] <= 0).tolist():
-            step = across[k] - across[k + 1]
-            part = across[k] / step if step else 0.5
-            x, _, z = seen[k] + part * (seen[k + 1] - seen[k])
-            if abs(x) <= 0.5 * width and 0 <= z < nearest:
-                length = np.linalg.norm(self.points[k + 1] - self.points[k])
-                nearest, cut = z, PlaneCut(float(self.lengths[k] + part * length), float(x))
-        return cut
+        k = np.flatnonzero(across[1:] * across[:-1] <= 0)
+        step = across[k] - across[k + 1]
+        part = np.divide(across[k], step, out=np.full(len(k), 0.5), where=step != 0)
+        x, _, z = (seen[k] + part[:, None] * (seen[k + 1] - seen[k])).T
+        below = np.flatnonzero((np.abs(x) <= 0.5 * width) & (z >= 0))
+        if not len(below):
+            return None
+        n = below[np.argmin(z[below])]
+        length = np.linalg.norm(self.points[k[n] + 1] - self.points[k[n]])
+        return PlaneCut(float(self.lengths[k[n]] + part[n] * length), float(x[n]))

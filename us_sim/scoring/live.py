@@ -24,8 +24,7 @@ from us_sim.scoring.settings import ScoreSettings
 from us_sim.slicing.b_mode import BMode
 from us_sim.volume.volume import Volume
 
-_LATE = 2.0
-"""s after its pose, from which on a force or an image that comes is passed over."""
+_LATE = 2.0  # s after its pose, from which on a force or an image that comes is passed over
 
 
 class Score(NamedTuple):
@@ -74,9 +73,8 @@ class LiveScan:
         self._meter = LumenMeter(self._lumens, self._scanner, lines=self.lines)
         self._settled = -np.inf  # s, until when samples are in the tally and the attempt
         self._tally = Tally(self._limits)
-        self._attempt = (
-            self._exercise.begin_attempt(self.lines) if self._exercise is not None else None
-        )
+        exercise = self._exercise
+        self._attempt = exercise.begin_attempt(self.lines) if exercise is not None else None
 
     def add_pose(self, time: float, pose: Pose) -> None:
         """Add a pose of the probe at a time (s); one that is not after those before is ignored."""
@@ -96,52 +94,42 @@ class LiveScan:
             self._meter.add_image(time, pose, labels)
 
     def set_answers(self, points: Sequence[str], thrombus: str) -> None:
-        """Set the learner's answers so far, see `Attempt.set_answers`.
-
-        Raises:
-            ScoreError: nothing is asked, the attempt has ended, or an answer will not do.
-        """
+        """Set the learner's answers so far, see `Attempt.set_answers`."""
         if self._attempt is None:
             raise ScoreError("answers: no exercise is followed")
-        self._attempt.set_answers(
-            points, thrombus, self._pose_times[-1] if self._pose_times else 0.0
-        )
+        time = self._pose_times[-1] if self._pose_times else 0.0
+        self._attempt.set_answers(points, thrombus, time)
 
     def _is_next(self, times: list[float], time: float) -> bool:
         return time > self._settled and not (times and time <= times[-1])
 
     def build_scan(self, since: float = -np.inf, until: float = np.inf) -> Scan | None:
-        """Return the scan so far, or a piece of it.
+        """Return the scan so far, or a piece of it, after a time until another (s).
 
-        Args:
-            since: s, end of the piece before.
-            until: s, end of this piece.
-
-        Returns:
-            None before there is a motion, or where the piece has one force and no other before it.
+        It is None before there is a motion, or where the piece has one force and none before it.
         """
-        begin, end = _span(self._pose_times, since, until)
-        if end - begin < 2:
+        span = _span(self._pose_times, since, until)
+        times, poses = self._pose_times[span], self._poses[span]
+        if len(times) < 2:
             return None
-        poses = self._poses[begin:end]
-        motion = Motion(
-            np.array(self._pose_times[begin:end]),
-            np.array([pose.position for pose in poses]),
-            np.array([pose.orientation for pose in poses]),
-        )
-        begin, end = _span(self._force_times, since, until)
-        force = None
-        if end - begin > 1:
-            times = np.array(self._force_times[begin:end])
-            force = Force(times, np.array(self._newtons[begin:end]))
-        elif end > begin and self._force_times[begin] > since and until < np.inf:
+        positions = np.array([pose.position for pose in poses])
+        motion = Motion(np.array(times), positions, np.array([pose.orientation for pose in poses]))
+        span, force = _span(self._force_times, since, until), None
+        times = self._force_times[span]
+        if len(times) > 1:
+            force = Force(np.array(times), np.array(self._newtons[span]))
+        elif times and times[0] > since and until < np.inf:
             return None
-        sections = self._meter.collect_sections(*_span(self._meter.times, since, until))
+        sections = self._meter.collect_sections(_span(self._meter.times, since, until))
         return Scan(motion, force, sections, self.lines, self._thrombi, since=since)
 
     def compute_score(self) -> Score | None:
         """Return the score so far; None before there is a motion."""
-        self._settle()
+        until = self._find_end()
+        piece = self.build_scan(self._settled, until) if until > self._settled else None
+        if piece is not None:
+            _add(self._tally, self._attempt, piece)
+            self._settled = until
         scan = self.build_scan(self._settled)
         if scan is None:
             return None
@@ -160,14 +148,6 @@ class LiveScan:
             attempt.was_in_air,
         )
 
-    def _settle(self) -> None:
-        """Add what later samples cannot change any more."""
-        until = self._find_end()
-        piece = self.build_scan(self._settled, until) if until > self._settled else None
-        if piece is not None:
-            _add(self._tally, self._attempt, piece)
-            self._settled = until
-
     def _find_end(self) -> float:
         """Return the last time (s) after which a piece may begin.
 
@@ -180,19 +160,17 @@ class LiveScan:
         times = self._force_times
         if not times or times[-1] <= latest:
             times = self._pose_times
-        images = self._meter.times
-        for k in range(bisect_right(times, latest) - 1, -1, -1):
-            if times[k] <= self._settled:
-                break
-            image = bisect_right(images, times[k]) - 1
+        new = times[bisect_right(times, self._settled) : bisect_right(times, latest)]
+        for time in reversed(new):
+            image = bisect_right(self._meter.times, time) - 1
             if image < 0 or self._meter.is_settled(image):
-                return times[k]
+                return time
         return self._settled
 
 
-def _span(times: list[float], since: float, until: float) -> tuple[int, int]:
+def _span(times: list[float], since: float, until: float) -> slice:
     """Return the slice of a piece's samples, from the last sample before it on."""
-    return max(bisect_right(times, since) - 1, 0), bisect_right(times, until)
+    return slice(max(bisect_right(times, since) - 1, 0), bisect_right(times, until))
 
 
 def _add(tally: Tally, attempt: Attempt | None, scan: Scan) -> None:

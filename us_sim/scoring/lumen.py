@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.scoring.centre_line import CentreLine, compute_voxel_centres
 from us_sim.scoring.metrics import VesselSection
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.probe.probe import Probe
 from us_sim.tissue.elasticity.material import guess_tissue_kind
 from us_sim.volume.volume import Volume
 
@@ -20,8 +20,7 @@ VESSELS = ("vein", "artery")  # kinds of tissue whose cross-sections are measure
 _HARDLY_CUT = 0.1
 """Of a vessel's mean cross-section, or else of its largest in an image at rest: less of it is its
 edge, or cut off by the image."""
-_STEEPEST = 0.2
-"""Cosine of a probe's tilt; beyond it, how far it would have to be lifted means nothing."""
+_STEEPEST = 0.2  # cosine of a probe's tilt; beyond it, how far to lift it means nothing
 
 
 def lift_probe(pose: Pose) -> Pose:
@@ -93,7 +92,9 @@ class LumenMeter:
         typical = [0.0 if line is None else line.area for line in self._lines.values()]
         self._typical = np.array(typical).reshape(-1, 1)  # m²
         self._pixel = float(np.prod(scanner.probe.pixel_spacing))
-        self._edge = _find_edge(scanner.probe)
+        reached = np.pad(np.isfinite(scanner.probe.pixel_beams[0]), 1)
+        # the last pixels (rows, columns) of an image that its beams reach
+        self._edge = (reached & ~binary_erosion(reached))[1:-1, 1:-1]
         self.times: list[float] = []  # s, of all samples
         self._depths: list[float] = []  # m, of the probe below the skin
         self._cuts: list[list[tuple[float, float]]] = []  # m along and lateral, by vessel
@@ -108,7 +109,7 @@ class LumenMeter:
         cuts = [line and line.find_cut(above, width) for line in self._lines.values()]
         self.times.append(time)
         self._depths.append(float(pose.position[2]))
-        self._cuts.append([(cut.along, cut.lateral) if cut else (np.nan, np.nan) for cut in cuts])
+        self._cuts.append([cut or (np.nan, np.nan) for cut in cuts])
         self._areas.append([[self._pixel * float(v.sum()) for v in each] for each in inside])
         self._is_whole.append(~np.any([[v[self._edge].any() for v in each] for each in inside], 0))
 
@@ -117,39 +118,25 @@ class LumenMeter:
         sections = self.collect_sections()
         return {n: each for n, each in sections.items() if np.isfinite(each.at_rest).any()}
 
-    def collect_sections(self, begin: int = 0, end: int | None = None) -> dict[str, VesselSection]:
+    def collect_sections(self, span: slice = slice(None)) -> dict[str, VesselSection]:
         """Return the sections of these samples by the vessels' names; none without a sample."""
-        times = np.array(self.times[begin:end])
+        times = np.array(self.times[span])
         if not len(times):
             return {}
-        now, rest = self._compare_areas(begin, end)
-        cuts = np.array(self._cuts[begin:end]).transpose(1, 2, 0)
-        depths = np.array(self._depths[begin:end])
-        return {
-            name: VesselSection(times, now[k], rest[k], cuts[k, 0], cuts[k, 1], depths)
-            for k, name in enumerate(self._lumens)
-        }
-
-    def _compare_areas(
-        self, begin: int, end: int | None
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return areas (V, K) m² of these samples now, and at rest, NaN where none is known."""
-        now, rest = np.array(self._areas[begin:end]).transpose(1, 2, 0)
-        whole, count = np.array(self._is_whole[begin:end]).T.copy(), now.shape[1]
+        now, rest = np.array(self._areas[span]).transpose(1, 2, 0)  # by vessel and sample
+        along, lateral = np.array(self._cuts[span]).transpose(2, 1, 0)
+        whole, last = np.array(self._is_whole[span]).T.copy(), len(times) - 1
         is_gone = (now == 0.0) & (rest > 0.0)  # pushed out, maybe not closed
-        for k in [*range(1, count), *range(count - 2, -1, -1)]:
-            for beside in {max(k - 1, 0), min(k + 1, count - 1)}:
+        for k in [*range(1, last + 1), *range(last - 1, -1, -1)]:
+            for beside in {max(k - 1, 0), min(k + 1, last)}:
                 whole[:, k] &= whole[:, beside] | ~is_gone[:, k]
         typical = np.where(self._typical > 0, self._typical, rest.max(axis=1, keepdims=True))
-        return now, np.where((rest <= _HARDLY_CUT * typical) | ~whole, np.nan, rest)
+        rest = np.where((rest <= _HARDLY_CUT * typical) | ~whole, np.nan, rest)
+        depths = np.array(self._depths[span])
+        sections = map(VesselSection, repeat(times), now, rest, along, lateral, repeat(depths))
+        return dict(zip(self._lumens, sections, strict=True))
 
     def is_settled(self, sample: int) -> bool:
         """Return whether later samples change nothing of this one and those before."""
         now, rest = self._areas[sample]
         return not any(n == 0.0 and r > 0.0 for n, r in zip(now, rest, strict=True))
-
-
-def _find_edge(probe: Probe) -> NDArray[np.bool_]:
-    """Mark the last pixels (rows, columns) of an image that its beams reach."""
-    reached = np.pad(np.isfinite(probe.pixel_beams[0]), 1)
-    return np.asarray((reached & ~binary_erosion(reached))[1:-1, 1:-1])
