@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from html import escape
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -13,35 +12,25 @@ import pandas as pd
 from us_sim.scoring.result import encode_picture
 
 CLASS_FILES = ("class.csv", "class.html")
-_NOBODY = "somebody"
 _ALT = "Points right of each attempt, over time, for each student"
 
 
 def tabulate_results(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Return one row for each result: who, what, when, what became of it, and plain metrics.
-
-    Args:
-        results: documents, by the time of their begin.
-    """
-    rows = []
-    for result in results:
-        about, steps = result["about"], result["steps"]
-        right = sum(step["state"] == "done" for step in steps)
-        rows.append(
-            {
-                "student": about.get("student") or _NOBODY,
-                "exercise": result["name"],
-                "begun": about["begun"],
-                "result": result["state"],
-                **dict([*result["plain"].items()][:-1]),  # the last is told in two columns
-                "right": right,
-                "of": len(steps),
-                "faults": len(result["faults"]),
-                "volume": about.get("volume", ""),
-                "changed": about.get("changed", ""),
-                "checksum": about.get("checksum", ""),
-            }
-        )
+    """Return one row for each result: who, what, when, what became of it, and plain metrics."""
+    rows = [
+        {
+            "student": each["about"].get("student") or "somebody",
+            "exercise": each["name"],
+            "begun": each["about"]["begun"],
+            "result": each["state"],
+            **dict([*each["plain"].items()][:-1]),  # the last is told in two columns
+            "right": sum(step["state"] == "done" for step in each["steps"]),
+            "of": len(each["steps"]),
+            "faults": len(each["faults"]),
+            **{key: each["about"].get(key, "") for key in ("volume", "changed", "checksum")},
+        }
+        for each in results
+    ]
     return pd.DataFrame(rows)
 
 
@@ -51,33 +40,26 @@ def write_class_table(table: pd.DataFrame, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     table.to_csv(files[0], index=False)
     shown = table.drop(columns=["volume", "checksum"]).fillna("-")
+    students, exercises = table["student"].nunique(), table["exercise"].nunique()
+    passed = (table["result"] == "passed").sum()
     files[1].write_text(
         '<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>Class</title>'
         "<style>body {font-family: sans-serif; margin: 2em} td, th {padding: 0.2em 0.8em; "
         "text-align: left} img {max-width: 100%}</style><h1>Class</h1>"
-        f'<p>{escape(_summary(table))}</p><img src="{encode_picture(_draw(table))}" alt="{_ALT}">'
+        f"<p>{students} students, {exercises} exercises, {len(table)} attempts, {passed} of them "
+        f'passed.</p><img src="{encode_picture(_draw(table))}" alt="{_ALT}">'
         f"{shown.to_html(index=False, border=0)}</html>",
         encoding="utf-8",
     )
     return files
 
 
-def _summary(table: pd.DataFrame) -> str:
-    passed = table[table["result"] == "passed"]
-    return (
-        f"{table['student'].nunique()} students, {table['exercise'].nunique()} exercises, "
-        f"{len(table)} attempts, {len(passed)} of them passed."
-    )
-
-
 def _draw(table: pd.DataFrame) -> bytes:
     """Draw the part of the points that is right over time: a row for each exercise."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     exercises = list(dict.fromkeys(table["exercise"]))
     figure = Figure(figsize=(9, 1.0 + 1.8 * len(exercises)), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
     grid = figure.subplots(len(exercises), 1, sharex=True, squeeze=False)
     times = pd.to_datetime(table["begun"], utc=True)
     students = {name: f"C{k % 10}" for k, name in enumerate(sorted(table["student"].unique()))}

@@ -23,21 +23,18 @@ def draw_score(file: Path | IO[bytes], title: str, scan: Scan, steps: Sequence[S
 
     A scan with neither has the speed over time.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 5.2), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=12, x=0.01, ha="left")
     is_measured = any(np.isfinite(each.fraction).any() for each in scan.sections.values())
     over_time = [_draw_force] * (scan.force is not None) + [_draw_areas] * is_measured
     over_time = over_time or [_draw_speed]
     grid = figure.add_gridspec(len(over_time), 2, width_ratios=(1, 1.4))
     _draw_way(figure.add_subplot(grid[:, 0]), scan, steps)
-    first: Axes | None = None
+    shared: Axes | None = None
     for row, draw in enumerate(over_time):
-        axes = figure.add_subplot(grid[row, 1], sharex=first)
-        first = first or axes
+        axes = shared = figure.add_subplot(grid[row, 1], sharex=shared)
         draw(axes, scan)
     axes.set_xlabel("s since the first pose")
     for axes in figure.axes:

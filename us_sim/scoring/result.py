@@ -58,12 +58,7 @@ def classify_attempt(score: Score, void: str = "") -> str:
 
 
 def render_page(result: Mapping[str, Any], picture: bytes = b"") -> str:
-    """Return the result as a page in one file.
-
-    Args:
-        result: the document.
-        picture: PNG of the score.
-    """
+    """Return the document of a result, with a PNG of the score, as a page in one file."""
     title = escape(result["name"])
     steps = [(MARKS[s["state"]], s["what"], s["seen"]) for s in result["steps"]]
     faults = [(f"{each['seconds']} s", each["what"]) for each in result["faults"]]

@@ -18,11 +18,7 @@ KEPT_FOLDER = "us_sim_results"
 
 
 class ResultPlace:
-    """A place that results are written to, with those that it has refused so far.
-
-    Args:
-        address: a folder, or one of fsspec.
-    """
+    """A folder or address of fsspec that results are written to, and those it has refused."""
 
     def __init__(self, address: str) -> None:
         self._address = address.rstrip("/")
@@ -42,14 +38,9 @@ class ResultPlace:
                 Path(file).unlink()
 
     def write(self, result: Mapping[str, Any], picture: bytes) -> list[str]:
-        """Write the page and the document, named by student, exercise and begin.
+        """Write the page, with a PNG, and the document; return the two files' addresses.
 
-        Args:
-            result: the document.
-            picture: PNG of the score.
-
-        Returns:
-            The two files' addresses.
+        They are named by student, exercise and begin.
 
         Raises:
             ScoreError: they cannot be written; it names the file on this machine that keeps them.
@@ -64,7 +55,10 @@ class ResultPlace:
         try:
             return _write_files(self._address, texts)
         except ScoreError as error:
-            kept = _write_on_this_machine(texts)
+            kept: list[str] = []
+            for root in (Path.cwd(), Path(tempfile.gettempdir())):
+                with contextlib.suppress(ScoreError):
+                    kept = kept or _write_files(str(root / KEPT_FOLDER), texts)
             self._kept.append((texts, kept))
             raise _refusal(error, kept) from error
 
@@ -100,13 +94,6 @@ def _write_files(address: str, texts: Mapping[str, str]) -> list[str]:
     except Exception as error:  # what a file system raises is its own
         raise ScoreError(f"results: {address}: cannot be written: {error}") from error
     return files
-
-
-def _write_on_this_machine(texts: Mapping[str, str]) -> list[str]:
-    for root in (Path.cwd(), Path(tempfile.gettempdir())):
-        with contextlib.suppress(ScoreError):
-            return _write_files(str(root / KEPT_FOLDER), texts)
-    return []
 
 
 def _refusal(error: ScoreError, kept: Sequence[str]) -> ScoreError:
