@@ -7,6 +7,7 @@ import pytest
 from bench import pose_at
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import Trigger
@@ -19,6 +20,7 @@ from us_sim.scene.building import build_scanner, load_volume
 from us_sim.scene.reading import load_scene
 from us_sim.scoring.result_place import KEPT_FOLDER
 
+BLIND = "name: b\nfeedback: afterwards\ntask: {kind: compression, points: 3}\n"
 KEEP = "name: hold\ntask: {kind: keep_force, force: 5 N, tolerance: 1 N, duration: 8 s}\n"
 VEIN = 6
 
@@ -209,10 +211,82 @@ def test_answers_are_refused_where_an_exercise_asks_nothing(node):
     assert "asks nothing" in refused.reason
 
 
-def test_answers_go_to_their_points_in_any_order(bench, small_scene, tmp_path):
+@pytest.fixture
+def examination(bench, small_scene, tmp_path):
+    """The scorer of an exercise that tells nothing before all is answered."""
     file = tmp_path / "blind.yaml"
-    file.write_text("name: b\nfeedback: afterwards\ntask: {kind: compression, points: 3}\n")
-    node = bench.make(Scorer, scene=str(small_scene), exercise=str(file))
+    file.write_text(BLIND)
+    return bench.make(
+        Scorer, scene=str(small_scene), exercise=str(file), results=str(tmp_path / "class")
+    )
+
+
+def answer(node):
+    points = Parameter("answers", value=["compressible"] * 3)
+    assert all(
+        node.set_parameters([each])[0].successful
+        for each in (points, Parameter("thrombus", value="none"))
+    )
+
+
+def test_an_examination_tells_no_metrics_and_draws_no_picture_before_its_end(
+    bench, examination, tmp_path
+):
+    scores = bench.collect(DiagnosticArray, "score", latched=True)
+    pictures = bench.collect(CompressedImage, "score/picture", latched=True)
+    press(bench, 5.0)
+    bench.spin_until(lambda: bool(scores) and told(scores[-1], "plain")["Highest force, N"] == "5")
+    assert statuses(scores[-1], "plain")[0].message == "running"
+    assert not values(scores[-1])
+    assert not ask(bench, "draw")
+    bench.spin_for(20)
+    assert not any(len(each.data) for each in pictures)
+    assert not (tmp_path / "class").exists()
+    answer(examination)
+    bench.spin_until(lambda: bool(values(scores[-1])) and len(pictures[-1].data) > 0)
+    [result] = [json.loads(each.read_text()) for each in (tmp_path / "class").glob("*.json")]
+    assert result["metrics"] == values(scores[-1])
+    assert ask(bench, "draw")
+
+
+def told(score, kind):
+    return {each.key: each.value for each in statuses(score, kind)[0].values}
+
+
+def test_an_arm_is_known_once_an_examination_of_it_has_ended(bench, examination):
+    scores = bench.collect(DiagnosticArray, "score", latched=True)
+
+    def begin_anew():
+        assert ask(bench, "clear")
+        scores.clear()
+        press(bench, 5.0)
+        bench.spin_until(lambda: bool(scores))
+        return told(scores[-1], "about")["arm"]
+
+    press(bench, 5.0)
+    bench.spin_until(lambda: bool(scores))
+    assert begin_anew() == ""  # nothing was told
+    answer(examination)
+    bench.spin_until(lambda: statuses(scores[-1], "plain")[0].message == "not passed")
+    assert told(scores[-1], "about")["arm"] == ""
+    assert begin_anew() == "known from an attempt before"
+
+
+@pytest.mark.usefixtures("node")
+def test_a_setting_that_is_changed_meanwhile_stands_in_the_result(bench):
+    events = bench.publisher(ParameterEvent, "/parameter_events")
+    scores = bench.collect(DiagnosticArray, "score", latched=True)
+    press(bench, 5.0)
+    for name in ("slice_interpolator", "viewer"):
+        gain = Parameter("gain", value=3.0).to_parameter_msg()
+        stamp = pose_at(0.0, 5).header.stamp
+        events.publish(ParameterEvent(stamp=stamp, node=f"/{name}", changed_parameters=[gain]))
+    bench.spin_until(lambda: bool(scores) and told(scores[-1], "about")["changed"] != "")
+    assert told(scores[-1], "about")["changed"] == "slice_interpolator.gain = 3.0 at 4 s"
+
+
+def test_answers_go_to_their_points_in_any_order(bench, examination):
+    node = examination
     scores = bench.collect(DiagnosticArray, "score", latched=True)
     press(bench, 5.0)
     answers = Parameter("answers", value=["-", "not seen"])
