@@ -39,12 +39,12 @@ class Scorer:
         if what == "draw":
             self.picture.offer_packet(lambda n: Packet(PICTURE, n, {}, PNG))
 
-    def say(self, steps, feedback="live"):
+    def say(self, steps, feedback="live", changed=""):
         header = {"name": "Compression", "description": "Compress the vein.", "scene": "arm"}
         header |= {"metrics": {"Path Length, mm": "60"}, "steps": list(steps), "faults": []}
         is_done = all(step["state"] == "done" for step in header["steps"])
         header |= {"state": "passed" if is_done else "running", "plain": {"Time, s": "12"}}
-        header |= {"about": {"begun": "now", "feedback": feedback}}
+        header |= {"about": {"begun": "now", "feedback": feedback, "changed": changed}}
         self.score.offer_packet(lambda n: Packet(SCORE, n, header, b""))
 
 
@@ -59,6 +59,10 @@ def test_task_steps_and_score_are_shown_begun_anew_and_saved(page, simulator):
     page.get_by_text("To do: vein at <b>29 mm, not reached").wait_for()
     page.get_by_text("Done: vein at 9 mm, closed at 6.0 N").wait_for()
     page.get_by_text("goes on: 1 of 2 done, 12 s", exact=True).wait_for()
+    scorer.say(
+        STEPS, changed="slice_interpolator.depth = 0.1 at 3 s; slice_interpolator.gain = 5 at 8 s"
+    )
+    page.get_by_text("1 of 2 done, 12 s; gain = 5 at 8 s: stands in the result").wait_for()
     page.get_by_text("More", exact=True).click()
     page.get_by_text("Path Length, mm").wait_for()
     page.get_by_role("button", name="Begin anew").click()

@@ -149,15 +149,17 @@ class ExercisePanel:
         seconds = next(iter(score.get("plain", {}).values()), "-")
         clock = f", {seconds} s" if seconds != "-" else ""
         state = STATES[score.get("state", "to lift")]
-        is_asked = is_blind(score) and score["state"] == "running"
-        asks = is_asked and not self._only_watches
+        about = score.get("about", {})
+        change = about.get("changed", "").rpartition("; ")[2].partition(".")[2]  # the last
+        noted = f"; {change}: stands in the result" if change else ""
+        asks = is_blind(score) and score["state"] == "running" and not self._only_watches
         count = "" if is_blind(score) else f": {sum(done)} of {len(done)} done"
-        self._result.set_text(f"{state}{count}{clock}" if done else "")
+        self._result.set_text(f"{state}{count}{clock}{noted}" if done else "")
         self._buttons.set_visibility(bool(name) and not self._only_watches)
         for button in self._after:
             button.set_visibility(not is_blind(score))
-        if score.get("about", {}).get("begun") != self._begun:
-            self._begun, self._given = score.get("about", {}).get("begun"), []
+        if about.get("begun") != self._begun:
+            self._begun, self._given = about.get("begun"), []
         parts: list[tuple[Element, Callable[..., None], tuple[Any, ...]]] = [
             (self._steps, self._draw_steps, (steps, asks, tuple(self._find_answers()))),
             (self._faults, _draw_faults, (score.get("faults", []),)),
