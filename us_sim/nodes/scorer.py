@@ -189,6 +189,7 @@ class Scorer(SceneNode):
             "arm": "known from an attempt before" if self._is_known else "",
             "us_sim": __version__,
         }
+        metrics = [] if self._is_hidden(score) else score.metrics
         plain = select_plain_metrics(score, self._limits.force_limit)
         faults = [{"seconds": round(each.time, 1), "what": each.what} for each in score.faults]
         if self._void:
@@ -203,9 +204,7 @@ class Scorer(SceneNode):
             "plain": {each.label: each.format(3) for each in plain},
             "steps": [step.to_document() for step in score.steps],
             "faults": faults,
-            "metrics": {}
-            if self._is_hidden(score)
-            else {m.label: m.format() for m in score.metrics},
+            "metrics": {each.label: each.format() for each in metrics},
         }
 
     def _is_hidden(self, score: Score) -> bool:
