@@ -66,10 +66,9 @@ def load_or_create(
 def _load(entry: Path, unpack: Callable[[Arrays, Facts], Thing]) -> Thing | None:
     """Load the entry's thing; None where it is absent or damaged."""
     try:
-        facts = json.loads((entry / "facts.json").read_text(encoding="utf-8"))
         # Plain arrays over the maps: a subclass would slow and surprise callers.
         arrays = {f.stem: np.asarray(np.load(f, mmap_mode="r")) for f in entry.glob("*.npy")}
-        return unpack(arrays, facts)
+        return unpack(arrays, json.loads((entry / "facts.json").read_text(encoding="utf-8")))
     except Exception:  # whatever a damaged entry leads to
         return None
 

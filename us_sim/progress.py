@@ -6,9 +6,11 @@ import shutil
 import sys
 from collections.abc import Callable
 
-from tqdm import tqdm
+from tqdm.std import TRLock, tqdm  # type: ignore[attr-defined]
 
 from us_sim.errors import printable_line
+
+tqdm.set_lock(TRLock())  # its own is a semaphore, which a process that is killed would leave behind
 
 
 class Progress(tqdm):

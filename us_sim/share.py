@@ -31,8 +31,7 @@ def shared_roots() -> Iterator[Path]:
 
 def shared_path(relative: str) -> Path:
     """Return the first of :func:`shared_roots` that has it, joined with ``relative``."""
-    roots = list(shared_roots())
-    for root in roots:
+    for root in (roots := [*shared_roots()]):
         if (root / relative).exists():
             return root / relative
     raise UsSimError(

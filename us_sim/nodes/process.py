@@ -82,9 +82,9 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     it is made, the status is `INTERRUPTED`: its work is not done. Bad input, also as the exception
     of that future, is one sentence on stderr and exit status 1.
     """
+    announce_often()
     for number in _ENDINGS:
         signal.signal(number, _interrupt_once)
-    announce_often()
     try:
         # rclpy's own handlers shut the context down from a thread, before ours has run: that could
         # then break off the very end of a node, and leave a recording without its index.

@@ -218,7 +218,7 @@ class Scorer(SceneNode):
         if score is None or not is_due or self._is_kept or self._exercise is None:
             return
         self._is_kept = True
-        scan = self._live.build_scan()
+        scan = None if self._is_hidden(score) else self._live.build_scan()
         picture = self._draw_score(scan, score.steps) if scan is not None else b""
         if not is_last:
             self._publish_picture(picture)

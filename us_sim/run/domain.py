@@ -1,14 +1,6 @@
 """The ROS domain that `us-sim` runs on: its arguments, its context, and one simulation on it.
 
 The arguments after ``--ros-args`` of the command line are for all nodes that it starts.
-
->>> from us_sim.run.domain import get_namespace, get_ros_arguments, take_ros_arguments
->>> take_ros_arguments(["run", "arm", "--ros-args", "-r", "__ns:=/a", "--", "-x"])
-['run', 'arm', '-x']
->>> get_ros_arguments(), get_namespace()
-(['-r', '__ns:=/a'], '/a')
->>> take_ros_arguments([]), get_ros_arguments(), get_namespace()
-([], [], '/')
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from multiprocessing.connection import Connection
 from multiprocessing.forkserver import ensure_running
 from typing import TYPE_CHECKING, Any
@@ -38,10 +38,21 @@ if sys.platform == "linux":  # elsewhere forks are not safe
     _forking.set_forkserver_preload([f"{__package__}.preloaded"])
 
 
+@contextlib.contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Have what is started meanwhile hear no Ctrl-C, until it is in a session of its own."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
 def begin_fork_server() -> None:
     """Have the server import what nodes share while this process does something else."""
     if _forking is not _spawning:
-        ensure_running()
+        with _without_interrupts():
+            ensure_running()
 
 
 def prepare_ros(*, network: bool) -> None:
@@ -93,12 +104,8 @@ class RunningNode:
         its_own = (node.node, node.module, node.arguments(), os.environ | node.secrets, its_output)
         context = _forking if is_forked else _spawning
         self._process = context.Process(target=_run_node, args=its_own, daemon=True)
-        # A process that is spawned hears Ctrl-C only once it is in a session of its own.
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
+        with _without_interrupts():
             self._process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         its_output.close()
         self.pid: int = self._process.pid
         self._reader = threading.Thread(target=self._read, args=(output, show), daemon=True)

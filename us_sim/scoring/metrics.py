@@ -152,7 +152,7 @@ class Tally:
         yield Metric("Elapsed Time", "s", total["time"])
         yield Metric("Path Length", "mm", _MM * total["path"])
         yield Metric("Rotation Total", "deg", _DEGREES * total["turn"])
-        yield Metric("Average Velocity", "mm/s", _MM * total["speed"] / total["steps"])
+        yield Metric("Average Velocity", "mm/s", _MM * total["speed"] / max(total["steps"], 1))
         yield Metric("Peak Velocity", "mm/s", _MM * self._fastest)
         if "contact" in total:
             yield Metric("Time in Contact", "s", total["contact"])
