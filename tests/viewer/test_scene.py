@@ -221,11 +221,15 @@ def test_structures_go_with_the_tissue(scene):
 
 
 def test_targets_stand_on_the_skin_in_the_colours_of_their_states_and_move_with_it(scene):
-    """The skin is at z = 0; of what is to do, the nearest to the probe at y = 40 mm is next."""
+    """The skin is at z = 0; of what is to do, the nearest to the probe at y = 40 mm is next.
+
+    Numbers are in the middle of their dots, of the same colours; here they are hidden at first.
+    """
+    style = scene.page.add_style_tag(content=".us-number { visibility: hidden }")
     for name in ("image", "structures", "force"):
         scene.ask(f"scene.setVisible('{name}', false)")
     states = {-0.04: "done", -0.02: "missed", 0.0: "to do", 0.02: "to do"}
-    places = [([-0.02, y, 0.013], state) for y, state in states.items()]
+    places = [([-0.015, y, 0.013], state) for y, state in states.items()]
     places.append(([0.0, 0.04, 0.013], "done"))  # which the probe hides
     steps = [
         {"what": f"{number}: vein", "seen": "open", "state": state, "target": [place]}
@@ -235,17 +239,26 @@ def test_targets_stand_on_the_skin_in_the_colours_of_their_states_and_move_with_
     score.offer_packet(lambda n: Packet("score", n, {"scene": "", "steps": steps}, b""))
 
     def stands(y: float, z: float = 0.0) -> list[float]:
-        return [-0.02, y, z]
+        return [-0.015, y, z]  # between vertices of the skin
 
     scene.becomes(stands(-0.04), lambda c: c[1] > c[0] + 60 and c[1] > c[2] + 40)  # green
     scene.becomes(stands(-0.02), lambda c: c[0] > c[2] + 80 and c[0] > c[1] + 80)  # red
     scene.becomes(stands(0.0), lambda c: c.min() > 200)  # white
     scene.becomes(stands(0.02), lambda c: c[2] > c[0] + 100 and c[2] > c[1] + 50)  # blue
     assert scene.page.locator(".us-task").inner_text() == "4: vein: open"
+    style.evaluate("style => style.remove()")
     numbers = scene.page.locator(".us-number:not([hidden])")
     assert numbers.all_inner_texts() == ["1", "2", "3", "4"]
+    colours = numbers.evaluate_all("all => all.map((each) => each.style.background)")
+    assert len(set(colours)) == 4
+    for number, y in zip(numbers.all(), states, strict=True):
+        box = number.bounding_box()
+        middle = box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"]
+        assert middle == pytest.approx(scene.place(stands(y)), abs=1.0)
+    scene.page.add_style_tag(content=".us-number { visibility: hidden }")
     scene.becomes([0.0, 0.04, 0.0], lambda c: not (c[1] > c[0] + 60))
-    scene.patient.dent(np.add(SKIN.vertices, [0.0, 0.0, 0.01]))
+    slope = np.outer(SKIN.vertices[:, 0] + 0.015, [0.0, 0.0, 1.0])
+    scene.patient.dent(SKIN.vertices + slope + [0.0, 0.0, 0.01])
     scene.ask("scene.setVisible('probe', false); scene.view('front')")
     scene.becomes(stands(0.02, 0.0095), lambda c: c[2] > c[0] + 100 and c[2] > c[1] + 50)
     scene.ask("scene.setVisible('targets', false)")

@@ -1,8 +1,8 @@
 /**
  * Where an exercise is to be done: dots on the skin.
  *
- * Dots stand on the skin above the points that are told, and move with it. Points bear the number
- * with which the text of their step begins.
+ * Dots stand on the skin above the points that are told, and move with it. A point bears, as large
+ * as can be read, the number with which the text of its step begins.
  */
 
 import { THREE } from "nicegui-scene";
@@ -17,6 +17,8 @@ const COLOURS = { done: "#5fd38a", missed: "#e5735c", next: "#4fa8ff", "to do": 
 /** m: radius of a point, and of the dots of a line. */
 const POINT = 0.0022;
 const DOT = 0.0008;
+/** Part of a triangle by which a point on its edge may seem beside it. */
+const EDGE = 1e-6;
 const MOST = 2000;
 
 const group = new THREE.Group();
@@ -30,8 +32,10 @@ dots.frustumCulled = false;
 dots.renderOrder = 8;
 group.add(dots);
 stage.scene.add(group);
+const numbers = Object.assign(document.createElement("div"), { className: "us-numbers" });
+stage.canvas.after(numbers);
 
-let steps = []; // {step, dots: [{point, vertex, aside, radius}], number}
+let steps = []; // {step, dots: [{point, corners, weights, radius}], number}
 let isOn = true;
 let boundTo; // the skin on which the dots stand
 let shown = ""; // all of it that is shown
@@ -66,26 +70,45 @@ function isBehindProbe(at) {
   return hits.some(({ distance }) => distance < way.length());
 }
 
-/** A number beside a point, over the scene. */
+/** A number in place of a point, over the scene. */
 function label(textContent) {
   const made = Object.assign(document.createElement("div"), { className: "us-number", textContent });
-  stage.place.append(made);
+  numbers.append(made);
   return made;
 }
 
-/** Find the vertex of the skin at rest nearest to each point, and how far beside it the point is. */
+/** Find the triangle of the skin at rest above each point, and the weights of its corners there. */
 function bind(points) {
   boundTo = points;
   if (!points) return;
-  const { rest } = points;
+  const { rest, triangles } = points;
   for (const dot of steps.flatMap(({ dots }) => dots)) {
-    let best = Infinity;
-    for (let i = 0; i < rest.length; i += 3) {
-      const far = Math.hypot(rest[i] - dot.point.x, rest[i + 1] - dot.point.y, rest[i + 2] - dot.point.z);
-      if (far < best) [best, dot.vertex] = [far, i];
+    const { x, y } = dot.point;
+    let top = Infinity;
+    dot.corners = undefined;
+    for (let t = 0; t < triangles.length; t += 3) {
+      const corners = [3 * triangles[t], 3 * triangles[t + 1], 3 * triangles[t + 2]];
+      const [i, j, k] = corners;
+      const [ax, ay] = [rest[j] - rest[i], rest[j + 1] - rest[i + 1]];
+      const [bx, by] = [rest[k] - rest[i], rest[k + 1] - rest[i + 1]];
+      const area = ax * by - ay * bx;
+      const v = ((x - rest[i]) * by - (y - rest[i + 1]) * bx) / area;
+      const w = (ax * (y - rest[i + 1]) - ay * (x - rest[i])) / area;
+      if (!(v >= -EDGE && w >= -EDGE && v + w <= 1 + EDGE)) continue; // beside, or upright
+      const weights = [1 - v - w, v, w];
+      const z = corners.reduce((sum, at, n) => sum + weights[n] * rest[at + 2], 0);
+      if (z < top) [top, dot.corners, dot.weights] = [z, corners, weights];
     }
-    dot.aside = dot.point.clone().sub(new THREE.Vector3().fromArray(rest, dot.vertex)).setZ(0);
   }
+}
+
+/** Where a dot stands now, m. */
+function placeOf({ point, corners, weights }, points) {
+  const place = new THREE.Vector3();
+  if (!points || !corners) return place.copy(point);
+  const corner = new THREE.Vector3();
+  corners.forEach((at, n) => place.addScaledVector(corner.fromArray(points.positions, at), weights[n]));
+  return place;
 }
 
 stage.beforeDrawing(() => {
@@ -96,13 +119,14 @@ stage.beforeDrawing(() => {
   const { next } = exercise;
   const place = new THREE.Matrix4();
   dots.count = 0;
-  for (const { step, dots: those } of steps) {
-    const colour = new THREE.Color(COLOURS[step === next ? "next" : step.state]);
+  for (const { step, dots: those, number } of steps) {
+    const style = COLOURS[step === next ? "next" : step.state];
+    const colour = new THREE.Color(style);
+    if (number) number.style.background = style;
     for (const dot of those) {
       if (dots.count === MOST) break;
-      const { point, vertex, aside, radius } = dot;
-      dot.at = points ? new THREE.Vector3().fromArray(points.positions, vertex).add(aside) : point;
-      place.makeScale(radius, radius, radius).setPosition(dot.at);
+      dot.at = placeOf(dot, points);
+      place.makeScale(dot.radius, dot.radius, dot.radius).setPosition(dot.at);
       dots.setMatrixAt(dots.count, place);
       dots.setColorAt(dots.count, colour);
       dots.count += 1;
@@ -118,7 +142,8 @@ stage.afterDrawing(() => {
     number.hidden = !group.visible || !dot.at || isBehindProbe(dot.at);
     if (number.hidden) continue;
     const { x, y } = stage.project(dot.at);
-    number.style.transform = `translate(${x.toFixed(0)}px, ${y.toFixed(0)}px)`;
+    number.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px)`;
+    number.style.zIndex = Math.round(-1e4 * stage.camera.position.distanceTo(dot.at));
   }
 });
 
