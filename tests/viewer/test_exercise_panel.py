@@ -13,7 +13,9 @@ from std_msgs.msg import String
 
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.qos import LATCHED
+from us_sim.viewer.remote_parameters import make_answer
 from us_sim.viewer.score import PICTURE, SCORE, connect_scorer
+from us_sim.viewer.session import SessionBoard, SessionState
 from us_sim.viewer.stream import CallPoster, Feed, Packet, Simulator
 
 STEPS = (
@@ -39,30 +41,35 @@ class Scorer:
         if what == "draw":
             self.picture.offer_packet(lambda n: Packet(PICTURE, n, {}, PNG))
 
-    def say(self, steps, feedback="live", changed=""):
+    def say(self, steps, feedback="live", changed="", state=""):
         header = {"name": "Compression", "description": "Compress the vein.", "scene": "arm"}
         header |= {"metrics": {"Path Length, mm": "60"}, "steps": list(steps), "faults": []}
         is_done = all(step["state"] == "done" for step in header["steps"])
-        header |= {"state": "passed" if is_done else "running", "plain": {"Time, s": "12"}}
+        state = state or ("passed" if is_done else "running")
+        header |= {"state": state, "plain": {"Time, s": "12"}}
         header |= {"about": {"begun": "now", "feedback": feedback, "changed": changed}}
         self.score.offer_packet(lambda n: Packet(SCORE, n, header, b""))
 
 
-def test_task_steps_and_score_are_shown_begun_anew_and_saved(page, simulator):
-    scorer = Scorer(simulator)
-    page.goto(page.address)
+def open_panel(page, scorer, query=""):
+    page.goto(f"{page.address}{query}")
     page.locator("#us-panels").click()
     page.get_by_role("tab", name="Exercise").click()
-    page.get_by_text("No exercise is followed: choose one.").wait_for()
     until(lambda: scorer.picture.is_watched, "the panel is seen")
+
+
+def test_task_steps_and_score_are_shown_begun_anew_and_saved(page, simulator):
+    scorer = Scorer(simulator)
+    open_panel(page, scorer)
+    page.get_by_text("No exercise is followed: choose one.").wait_for()
     scorer.say(STEPS)
     page.get_by_text("To do: vein at <b>29 mm, not reached").wait_for()
     page.get_by_text("Done: vein at 9 mm, closed at 6.0 N").wait_for()
     page.get_by_text("goes on: 1 of 2 done, 12 s", exact=True).wait_for()
     scorer.say(
-        STEPS, changed="slice_interpolator.depth = 0.1 at 3 s; slice_interpolator.gain = 5 at 8 s"
+        STEPS, changed="slice_interpolator.gain = 3.0 at 7 s; tissue_deformer.solver = a at 9 s"
     )
-    page.get_by_text("1 of 2 done, 12 s; gain = 5 at 8 s: stands in the result").wait_for()
+    page.get_by_text("Changed, and told in the result: gain, solver").wait_for()
     page.get_by_text("More", exact=True).click()
     page.get_by_text("Path Length, mm").wait_for()
     page.get_by_role("button", name="Begin anew").click()
@@ -90,10 +97,7 @@ def test_a_blind_exercise_hides_the_truth_and_asks(page, simulator):
 
     simulator.nodes.get_node("scorer").set_value = answer
     steps = [{**STEPS[1], "what": what} for what in ("point 1", "point 2", "thrombus")]
-    page.goto(page.address)
-    page.locator("#us-panels").click()
-    page.get_by_role("tab", name="Exercise").click()
-    until(lambda: scorer.picture.is_watched, "the panel is seen")
+    open_panel(page, scorer)
     scorer.say(steps, feedback="afterwards")
     page.get_by_role("button", name="Show the result").wait_for(state="hidden")
     page.get_by_role("button", name="point 1: not compressible").click()
@@ -109,12 +113,47 @@ def test_a_blind_exercise_hides_the_truth_and_asks(page, simulator):
     page.get_by_role("button", name="Outlines").wait_for()
 
 
+def test_to_begin_a_blind_exercise_anew_loads_another_arm(page, simulator):
+    """The arm of before is known: the scorer does not clear it, the exercise is drawn again."""
+    asked = []
+
+    def send(values):
+        asked.append(values)
+        return make_answer("")
+
+    scorer, simulator.session = Scorer(simulator), SessionBoard(send=send)
+    simulator.session.state = SessionState(
+        is_there=True, scene="arm", origin="exercise:examination#675"
+    )
+    open_panel(page, scorer)
+    scorer.say(STEPS, feedback="afterwards")
+    page.get_by_role("button", name="Begin anew").click()
+    page.get_by_role("dialog").get_by_role("button", name="Begin anew").click()
+    until(lambda: asked == [{"scene": "exercise:examination"}], "another arm is loaded")
+    assert not scorer.asked
+
+
+@pytest.mark.parametrize(
+    ("state", "target", "hint"),
+    [
+        ("to lift", [], "Press Lift"),
+        ("to do", [[0, 0, 0]], "Click a dot on the skin to move the probe over it"),
+        ("running", [], "Drag down on the image to press harder"),
+        ("running", [[0, 0, 0]] * 9, "Drag sideways on the image"),
+        ("running", [[0, 0, 0]], "Then press Lift, and click the next dot."),
+        ("not passed", [], "Begin anew starts another attempt"),
+    ],
+)
+def test_a_hint_is_of_the_moment_and_the_task(page, simulator, state, target, hint):
+    scorer = Scorer(simulator)
+    open_panel(page, scorer)
+    scorer.say([{**STEPS[1], "target": target}], state=state)
+    page.get_by_text(hint).wait_for()
+
+
 def test_who_only_watches_answers_and_erases_nothing(page, simulator):
     scorer = Scorer(simulator)
-    page.goto(f"{page.address}?watch")
-    page.locator("#us-panels").click()
-    page.get_by_role("tab", name="Exercise").click()
-    until(lambda: scorer.picture.is_watched, "the panel is seen")
+    open_panel(page, scorer, "?watch")
     scorer.say(STEPS, feedback="afterwards")
     page.get_by_text("To do: vein at <b>29 mm, not reached").wait_for()
     assert not page.get_by_role("button", name="not compressible").count()

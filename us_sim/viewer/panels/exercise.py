@@ -21,6 +21,7 @@ from us_sim.viewer.panels.asking import (
 )
 from us_sim.viewer.panels.controls import WhileShown
 from us_sim.viewer.panels.session import ask_to_load, is_confirmed
+from us_sim.viewer.parameters import format_name
 from us_sim.viewer.score import PICTURE, SCORE, get_score, is_blind
 from us_sim.viewer.stream import Feed, Simulator
 
@@ -39,7 +40,7 @@ _SCORER = "scorer"
 
 
 class Hints(Element, component="hints.js"):
-    """Instructions for a person who sees the panel for the first time."""
+    """Tells a person what to do with the mouse at the moment."""
 
 
 class ExercisePanel:
@@ -65,19 +66,15 @@ class ExercisePanel:
             self._about = ui.label().classes("us-note")
             self._hints = Hints()
             self._result = ui.label().classes("us-session-state").props('role="status"')
+            self._changed = ui.label().classes("us-note")
             self._steps = ui.column().classes("us-steps")
             self._faults = ui.column().classes("us-steps us-session-problem")
             with ui.row() as self._buttons:
-                self._after: list[ui.button] = []  # of which nothing is told before the end
-                for label, title, work in (
-                    ("Begin anew", "Forget what was done so far", self._clear),
-                    ("Show the result", "A picture of what was done so far", self._draw),
-                    ("Save the result", "Picture and numbers as a page to keep", self._save),
-                ):
-                    button = ui.button(label, on_click=work).props("flat dense no-caps")
-                    button.props["title"] = title
-                    self._after.append(button)
-                del self._after[0]
+                _button("Begin anew", "Forget what was done so far", self._clear)
+                self._after = [  # of which nothing is told before the end
+                    _button("Show the result", "A picture of what was done so far", self._draw),
+                    _button("Save the result", "Picture and numbers as a page to keep", self._save),
+                ]
             self._plain = ui.grid(columns=2).classes("us-metrics")
             self._image = ui.image().classes("us-score-picture").props("no-spinner")
             self._image.props["alt"] = _ALT
@@ -144,17 +141,20 @@ class ExercisePanel:
         name, steps = score.get("name", ""), score.get("steps", [])
         self._name.set_text(name or TITLE)
         self._about.set_text(score["description"] if name else NOTHING)
-        self._hints.set_visibility(bool(steps))
         done = [step["state"] == "done" for step in steps]
         seconds = next(iter(score.get("plain", {}).values()), "-")
         clock = f", {seconds} s" if seconds != "-" else ""
         state = STATES[score.get("state", "to lift")]
-        about = score.get("about", {})
-        change = about.get("changed", "").rpartition("; ")[2].partition(".")[2]  # the last
-        noted = f"; {change}: stands in the result" if change else ""
-        asks = is_blind(score) and score["state"] == "running" and not self._only_watches
+        is_asked = is_blind(score) and score["state"] == "running"
+        asks = is_asked and not self._only_watches
+        dots = max((len(step.get("target", ())) for step in steps), default=0)
+        self._hints.props.update(state=score.get("state", ""), dots=dots, asks=asks)
+        self._hints.set_visibility(bool(steps) and not self._only_watches)
+        changed = score.get("about", {}).get("changed", "")
+        self._changed.set_text(f"Changed, and told in the result: {_name_changed(changed)}")
+        self._changed.set_visibility(bool(changed))
         count = "" if is_blind(score) else f": {sum(done)} of {len(done)} done"
-        self._result.set_text(f"{state}{count}{clock}{noted}" if done else "")
+        self._result.set_text(f"{state}{count}{clock}" if done else "")
         self._buttons.set_visibility(bool(name) and not self._only_watches)
         for button in self._after:
             button.set_visibility(not is_blind(score))
@@ -257,6 +257,22 @@ class ExercisePanel:
             now = datetime.now().strftime("%Y-%m-%d-%H-%M-%S")
             page = render_page(get_score(self._simulator), self._get_picture())
             ui.download.content(page, f"us_sim-{now}.html", "text/html")
+
+
+def _button(label: str, title: str, on_click: Any) -> ui.button:
+    button = ui.button(label, on_click=on_click).props("flat dense no-caps")
+    button.props["title"] = title
+    return button
+
+
+def _name_changed(changes: str) -> str:
+    """Name the parameters in the scorer's list of changes, each once.
+
+    >>> _name_changed("slice_interpolator.gain = 3.0 at 7 s; slice_interpolator.gain = 6.0 at 8 s")
+    'gain'
+    """
+    parameters = (change.partition(" = ")[0].partition(".")[2] for change in changes.split("; "))
+    return ", ".join(dict.fromkeys(map(format_name, parameters)))
 
 
 def _draw_faults(faults: Iterable[Mapping[str, str]]) -> None:

@@ -1,17 +1,37 @@
-/** For who sees the panel of an exercise for the first time: one hint after another. */
-const HINTS = [
-  "Drag the probe over the skin to place it; drag down on the image to press.",
-  "The dots on the skin are the points of the list; the image says force and press.",
-  "Begin anew forgets what was done. Save the result keeps it as a page.",
-];
+/** How a person does what an exercise asks for at the moment. */
+
+const LIFT = "Press Lift below the 3D view, or key L.";
+const LAND = "Drag down on the image until the probe touches the skin.";
+const LAND_ON_DOT =
+  "Click a dot on the skin to move the probe over it; drag down on the image until it touches.";
+const PRESS = "Drag down on the image to press harder, up to press less.";
+const SLIDE = "Drag sideways on the image to slide the probe along it.";
+const COMPRESS =
+  "Drag down on the image to press, up to let go. Then press Lift, and click the next dot.";
+const ANSWER = "Say below each point what you saw.";
+const END = "Begin anew starts another attempt; Save the result keeps this one as a page.";
 
 export default {
   template: `
-    <div class="us-steps">
-      <div v-if="number < hints.length" class="row no-wrap us-step">
-        <div class="us-note">{{ hints[number] }}</div>
-        <q-btn flat dense round size="sm" icon="close" aria-label="Next hint" @click="number += 1" />
-      </div>
+    <div v-if="!isClosed" class="row no-wrap us-step">
+      <q-icon name="lightbulb" />
+      <div class="us-note">{{ hint }}</div>
+      <q-btn flat dense round size="sm" icon="close" aria-label="No hints" @click="isClosed = true" />
     </div>`,
-  data: () => ({ hints: HINTS, number: 0 }),
+  props: {
+    state: String, // of the attempt, see STATES of the scorer
+    dots: Number, // of the step that has most: 1 of a point, more of a line, 0 where any place does
+    asks: Boolean, // the learner answers on points
+  },
+  data: () => ({ isClosed: false }),
+  computed: {
+    hint() {
+      const { state, dots, asks } = this;
+      if (state === "to lift") return LIFT;
+      if (state === "to do") return dots === 1 ? LAND_ON_DOT : LAND;
+      if (state !== "running") return END;
+      if (dots === 1) return asks ? `${COMPRESS} ${ANSWER}` : COMPRESS;
+      return dots ? SLIDE : PRESS;
+    },
+  },
 };
