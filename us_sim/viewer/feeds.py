@@ -84,15 +84,8 @@ def make_topic_feed(
 ) -> Feed:
     """Make the feed of one topic's messages.
 
-    Args:
-        node: the node that subscribes.
-        post: runs calls in the node's thread.
-        message_type: type of the topic.
-        topic: its name.
-        make: makes the packet of a message; an error that it raises is reported.
-        kind: the stream's name.
-        rate: Hz, largest rate for each page; None sends every message.
-        qos: of the subscription.
+    An error that ``make`` raises is reported. ``rate`` is the largest for each page, Hz; None sends
+    every message.
     """
 
     def offer(data: bytes) -> None:

@@ -26,13 +26,7 @@ _STATES = {DiagnosticStatus.OK: "done", DiagnosticStatus.ERROR: "missed"}
 
 
 def connect_scorer(node: GuardedNode, post: CallPoster, simulator: Simulator) -> None:
-    """Add the score's feeds, requests to `scorer`, and marks of frozen images to the simulator.
-
-    Args:
-        node: the node that subscribes.
-        post: runs calls in the node's thread.
-        simulator: the simulator as pages see it.
-    """
+    """Add the score's feeds, requests to `scorer`, and marks of frozen images to the simulator."""
     marks = node.create_publisher(
         String, MARKER, STREAM, qos_overriding_options=qos_override_options()
     )
@@ -49,21 +43,12 @@ def connect_scorer(node: GuardedNode, post: CallPoster, simulator: Simulator) ->
 
     simulator.commands["frozen"] = mark
     simulator.ask_scorer = lambda what: post(lambda: ask(what))
-    simulator.add_feeds(
-        make_topic_feed(
-            node, post, DiagnosticArray, "score", make_score_packet, SCORE, None, LATCHED
-        ),
-        make_topic_feed(
-            node,
-            post,
-            CompressedImage,
-            "score/picture",
-            _make_picture_packet,
-            PICTURE,
-            None,
-            LATCHED,
-        ),
-    )
+    for message_type, topic, make, kind in (
+        (DiagnosticArray, "score", make_score_packet, SCORE),
+        (CompressedImage, "score/picture", _make_picture_packet, PICTURE),
+    ):
+        feed = make_topic_feed(node, post, message_type, topic, make, kind, None, LATCHED)
+        simulator.add_feeds(feed)
 
 
 def make_score_packet(message: DiagnosticArray, sequence: int) -> Packet:

@@ -156,11 +156,7 @@ SILENT_S = 3.0  # without a report, after which us-sim counts as gone: it report
 class ViewerSession(SessionBoard):
     """A board that follows the session's topics while a page shows it, and asks `session_control`.
 
-    Args:
-        node: the node that subscribes.
-        post: runs calls in the node's thread.
-        folder: as for `SessionBoard`.
-        is_own: as for `SessionBoard`.
+    It calls ``post`` to run a call in the node's thread.
     """
 
     def __init__(

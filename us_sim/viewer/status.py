@@ -159,12 +159,7 @@ class StatusBoard(PageCounter):
 
 
 class StatusListener(StatusBoard):
-    """A board that subscribes to ``diagnostics`` while a page shows it.
-
-    Args:
-        node: the node that subscribes.
-        post: runs calls in the node's thread.
-    """
+    """A board that subscribes to ``diagnostics`` while a page shows it, in the node's thread."""
 
     def __init__(self, node: GuardedNode, post: Callable[[Callable[[], Any]], Any]) -> None:
         super().__init__(lambda: post(self._subscribe))

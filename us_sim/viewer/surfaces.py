@@ -57,16 +57,12 @@ def weld_corners(corners: NDArray[np.floating]) -> tuple[NDArray[np.float64], ND
 def cluster_vertices(
     vertices: NDArray[np.floating], triangles: NDArray[np.integer], cell: float
 ) -> NDArray[np.integer]:
-    """Merge the vertices in each cell of a grid into one; return the triangles left, (F, 3).
+    """Merge the vertices in each cell (m) of a grid into one; return the triangles left, (F, 3).
 
     Vertex clustering after J. Rossignac and P. Borrel, "Multi-resolution 3D approximations for
     rendering complex scenes", 1993. All vertices are ones of the surface, so they also serve a
     deformed state. A closed surface stays closed: a sum of oriented triangles without a border.
-
-    Args:
-        vertices: (V, 3) m.
-        triangles: (T, 3) indices into vertices.
-        cell: m, side of the grid's cells.
+    Vertices are (V, 3) m, and triangles (T, 3).
     """
     used, corners = np.unique(triangles, return_inverse=True)
     points = vertices[used]
@@ -78,13 +74,7 @@ def cluster_vertices(
 def simplify_surface(
     vertices: NDArray[np.floating], triangles: NDArray[np.integer], count: int
 ) -> NDArray[np.integer]:
-    """Reduce a surface to ``count`` triangles or somewhat fewer.
-
-    Args:
-        vertices: (V, 3) m.
-        triangles: (T, 3) indices into vertices.
-        count: largest number of triangles.
-    """
+    """Reduce a surface, (V, 3) m and (T, 3), to ``count`` triangles or somewhat fewer."""
     sides = vertices[triangles] - vertices[np.roll(triangles, 1, axis=1)]
     cell, fewer = 0.5 * float(np.linalg.norm(sides, axis=2).mean()), triangles
     while len(fewer) > count:
@@ -143,13 +133,7 @@ class StreamedSurface:
     def make_packet(
         self, positions: NDArray[np.floating], *, kind: str, sequence: int, stamp: int
     ) -> Packet:
-        """Make the packet of present positions, as int16 steps from rest.
-
-        Args:
-            positions: (N, 3) m.
-            kind: the stream's name.
-            sequence: number of the packet.
-            stamp: ns.
+        """Make the packet of positions (N, 3), m, at a stamp, ns, as int16 steps from rest.
 
         Raises:
             MeshError: there are more or fewer points than at rest.
@@ -227,10 +211,7 @@ class CarriedSurfaces:
     def make_rest_packet(self, kind: str, sequence: int, mesh: int) -> Packet:
         """Make a packet of nodes (uint32), weights (float32), and triangles, fine and coarse.
 
-        Args:
-            kind: the stream's name.
-            sequence: number of the packet.
-            mesh: number of the tissue's mesh, whose nodes move the surfaces.
+        ``mesh`` is the number of the tissue's mesh, whose nodes move the surfaces.
         """
         parts = [
             {"name": name, "colour": list(colour), "fine": len(fine), "coarse": len(coarse)}
@@ -249,11 +230,8 @@ def make_transducer_packet(
 ) -> Packet:
     """Make a packet of each part's vertices (float32) and triangles (uint32), then the outline.
 
-    Args:
-        kind: the stream's name.
-        sequence: number of the packet.
-        parts: surfaces in frame ``probe``.
-        outline: (P, 3) m, as of `us_sim.slicing.probe.probe.compute_image_outline`.
+    Parts are in frame ``probe``; the outline (P, 3), m, is that of
+    `us_sim.slicing.probe.probe.compute_image_outline`.
     """
     described, arrays = [], list[NDArray[np.generic]]()
     for part in parts:
