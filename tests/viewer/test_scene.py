@@ -246,6 +246,9 @@ def test_targets_stand_on_the_skin_in_the_colours_of_their_states_and_move_with_
     scene.becomes(stands(0.0), lambda c: c.min() > 200)  # white
     scene.becomes(stands(0.02), lambda c: c[2] > c[0] + 100 and c[2] > c[1] + 50)  # blue
     assert scene.page.locator(".us-task").inner_text() == "4: vein: open"
+    again = [{**step, "seen": "closed"} for step in steps]
+    score.offer_packet(lambda n: Packet("score", n, {"scene": "", "steps": again}, b""))
+    scene.page.get_by_text("4: vein: closed").wait_for()
     style.evaluate("style => style.remove()")
     numbers = scene.page.locator(".us-number:not([hidden])")
     assert numbers.all_inner_texts() == ["1", "2", "3", "4"]

@@ -148,7 +148,7 @@ class ExercisePanel:
         is_asked = is_blind(score) and score["state"] == "running"
         asks = is_asked and not self._only_watches
         dots = max((len(step.get("target", ())) for step in steps), default=0)
-        self._hints.props.update(state=score.get("state", ""), dots=dots, asks=asks)
+        self._hints.props.update(state=score.get("state", ""), dots=dots)
         self._hints.set_visibility(bool(steps) and not self._only_watches)
         changed = score.get("about", {}).get("changed", "")
         self._changed.set_text(f"Changed, and told in the result: {_name_changed(changed)}")
@@ -198,7 +198,7 @@ class ExercisePanel:
         with ui.row().classes("us-answers"):
             for answer in (NO_THROMBUS, *points) if is_last else ANSWERS:
                 label = f"at {answer}" if answer.isdigit() else answer
-                button = ui.button(label).props("dense no-caps size=sm")
+                button = ui.button(label).props("dense no-caps")
                 button.props["outline"] = answer != given
                 button.props["aria-pressed"] = str(answer == given).lower()
                 button.on_click(lambda answer=answer: self._answer(number, answer, is_last))

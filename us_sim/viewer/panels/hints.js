@@ -8,7 +8,6 @@ const PRESS = "Drag down on the image to press harder, up to press less.";
 const SLIDE = "Drag sideways on the image to slide the probe along it.";
 const COMPRESS =
   "Drag down on the image to press, up to let go. Then press Lift, and click the next dot.";
-const ANSWER = "Say below each point what you saw.";
 const END = "Begin anew starts another attempt; Save the result keeps this one as a page.";
 
 export default {
@@ -21,16 +20,15 @@ export default {
   props: {
     state: String, // of the attempt, see STATES of the scorer
     dots: Number, // of the step that has most: 1 of a point, more of a line, 0 where any place does
-    asks: Boolean, // the learner answers on points
   },
   data: () => ({ isClosed: false }),
   computed: {
     hint() {
-      const { state, dots, asks } = this;
+      const { state, dots } = this;
       if (state === "to lift") return LIFT;
       if (state === "to do") return dots === 1 ? LAND_ON_DOT : LAND;
       if (state !== "running") return END;
-      if (dots === 1) return asks ? `${COMPRESS} ${ANSWER}` : COMPRESS;
+      if (dots === 1) return COMPRESS;
       return dots ? SLIDE : PRESS;
     },
   },

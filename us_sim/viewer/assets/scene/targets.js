@@ -35,7 +35,7 @@ stage.scene.add(group);
 const numbers = Object.assign(document.createElement("div"), { className: "us-numbers" });
 stage.canvas.after(numbers);
 
-let steps = []; // {step, dots: [{point, corners, weights, radius}], number}
+let steps = []; // {state, dots: [{point, corners, weights, radius}], number}, as exercise.steps
 let isOn = true;
 let boundTo; // the skin on which the dots stand
 let shown = ""; // all of it that is shown
@@ -46,12 +46,11 @@ function take() {
   if (text === shown) return;
   shown = text;
   for (const { number } of steps) number?.remove();
-  steps = exercise.steps.map((step) => {
-    const { what, target = [] } = step;
+  steps = exercise.steps.map(({ what, state, target = [] }) => {
     const radius = target.length > 1 ? DOT : POINT;
     const dots = target.map((at) => ({ point: new THREE.Vector3(...at), radius }));
     const [, name] = (dots.length === 1 && /^(?:point )?(\d+)(?:: |$)/.exec(what)) || [];
-    return { step, dots, number: name && label(name) };
+    return { state, dots, number: name && label(name) };
   });
   boundTo = undefined;
   stage.move();
@@ -116,11 +115,11 @@ stage.beforeDrawing(() => {
   if (!group.visible) return;
   const points = skin.points;
   if (points !== boundTo) bind(points);
-  const { next } = exercise;
+  const next = exercise.steps.indexOf(exercise.next);
   const place = new THREE.Matrix4();
   dots.count = 0;
-  for (const { step, dots: those, number } of steps) {
-    const style = COLOURS[step === next ? "next" : step.state];
+  for (const [i, { state, dots: those, number }] of steps.entries()) {
+    const style = COLOURS[i === next ? "next" : state];
     const colour = new THREE.Color(style);
     if (number) number.style.background = style;
     for (const dot of those) {
