@@ -17,12 +17,13 @@ STANCE = {"x": 0.012, "y": 0.0, "z": 0.0, "press": 0.0042, "rotation": 0.0, "fan
 
 
 class FakeHand:
-    """Feeds ``image`` and ``hand``, and the command ``hand``."""
+    """Feeds ``image``, ``hand`` and ``score``, and the command ``hand``."""
 
     def __init__(self, simulator: Simulator) -> None:
         self.asked: list[dict[str, Any]] = []
         self.image, self.state = Feed("image", rate=None), Feed("hand", rate=None)
-        simulator.add_feeds(self.image, self.state)
+        self.score = Feed("score", rate=None)
+        simulator.add_feeds(self.image, self.state, self.score)
         simulator.commands["hand"] = self._take
         simulator.commands["take"] = self._take_over
         self.takes: list[Any] = []  # pages that were to take the probe

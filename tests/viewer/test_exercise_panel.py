@@ -137,10 +137,10 @@ def test_to_begin_a_blind_exercise_anew_loads_another_arm(page, simulator):
     ("state", "target", "hint"),
     [
         ("to lift", [], "Press Lift"),
-        ("to do", [[0, 0, 0]], "Click a dot on the skin to move the probe over it"),
+        ("to do", [[0, 0, 0]], "Click a number to move the probe over that point"),
         ("running", [], "Drag down on the image to press harder"),
         ("running", [[0, 0, 0]] * 9, "Drag sideways on the image"),
-        ("running", [[0, 0, 0]], "Then press Lift, and click the next dot."),
+        ("running", [[0, 0, 0]], "Then press Lift, and click the next number."),
         ("not passed", [], "Begin anew starts another attempt"),
     ],
 )

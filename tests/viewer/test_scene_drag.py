@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from fake_hand import FACE, FakeHand, show_patient
 
-from us_sim.viewer.stream import Simulator
+from us_sim.viewer.stream import Packet, Simulator
 
 SCENE = "import('/us_sim/assets/scene/scene.js')"
 CAMERA = f"() => {SCENE}.then(m => m.stage.camera.position.toArray())"
@@ -63,6 +63,15 @@ def test_over_the_skin_the_probe_is_put_under_the_pointer(page: Any, hand: FakeH
     hand.until(lambda: hand.asked and np.allclose(hand.asked[-1]["to"]["point"], last, atol=1.5e-3))
     np.testing.assert_allclose(hand.asked[0]["to"]["point"], first, atol=1.5e-3)
     assert all(set(wish["to"]) == {"point"} and not wish["by"] for wish in hand.asked)
+
+
+def test_a_click_on_the_number_of_a_point_puts_the_probe_there(page: Any, hand: FakeHand) -> None:
+    point = [0.05, -0.03, 0.01]
+    step = {"what": "1: vein", "seen": "", "state": "to do", "target": [point]}
+    hand.score.offer_packet(lambda n: Packet("score", n, {"scene": "", "steps": [step]}, b""))
+    page.locator(".us-number").click()
+    hand.until(lambda: len(hand.asked) == 1)
+    np.testing.assert_allclose(hand.asked[0]["to"]["point"], [*point[:2], 0.0], atol=1e-6)
 
 
 def test_the_probe_dragged_along_itself_presses_as_far(page: Any, hand: FakeHand) -> None:

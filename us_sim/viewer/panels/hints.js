@@ -2,12 +2,12 @@
 
 const LIFT = "Press Lift below the 3D view, or key L.";
 const LAND = "Drag down on the image until the probe touches the skin.";
-const LAND_ON_DOT =
-  "Click a dot on the skin to move the probe over it; drag down on the image until it touches.";
+const LAND_ON_POINT =
+  "Click a number to move the probe over that point; drag down on the image until it touches.";
 const PRESS = "Drag down on the image to press harder, up to press less.";
 const SLIDE = "Drag sideways on the image to slide the probe along it.";
 const COMPRESS =
-  "Drag down on the image to press, up to let go. Then press Lift, and click the next dot.";
+  "Drag down on the image to press, up to let go. Then press Lift, and click the next number.";
 const END = "Begin anew starts another attempt; Save the result keeps this one as a page.";
 
 export default {
@@ -26,7 +26,7 @@ export default {
     hint() {
       const { state, dots } = this;
       if (state === "to lift") return LIFT;
-      if (state === "to do") return dots === 1 ? LAND_ON_DOT : LAND;
+      if (state === "to do") return dots === 1 ? LAND_ON_POINT : LAND;
       if (state !== "running") return END;
       if (dots === 1) return COMPRESS;
       return dots ? SLIDE : PRESS;

@@ -4,7 +4,7 @@ import { isTyping } from "./typing.js";
 
 const PARTS = {
   "In the 3D view": [
-    ["drag over the skin", "put the probe there"],
+    ["drag over the skin, click a number", "put the probe there"],
     ["drag the probe along itself", "press, lift"],
     ["drag the probe sideways", "slide"],
     ["Shift + drag the probe", "fan and rock"],

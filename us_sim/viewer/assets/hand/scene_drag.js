@@ -2,7 +2,8 @@
  * Moving the probe in the 3D scene: dragging over the skin puts it there, dragging the probe along
  * itself presses, across itself slides, with shift it tilts. With two fingers down presses and
  * turning rotates: a finger puts the probe only once it moves, or is up, without another one.
- * The wheel presses over the probe, and with shift over the skin.
+ * The wheel presses over the probe, and with shift over the skin. A click on the number of a point
+ * puts the probe there, also where the probe hides the point.
  */
 
 import { events } from "../events.js";
@@ -34,6 +35,8 @@ onPointer((event, hit) => {
   }
   return true;
 });
+
+events.on("target", (point) => hand.leads && hand.ask({ to: { point } }));
 
 function press(event, hit) {
   if (hit?.object !== "probe" && !(event.shiftKey && hit)) return false;

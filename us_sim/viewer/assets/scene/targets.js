@@ -2,7 +2,8 @@
  * Where an exercise is to be done: dots on the skin.
  *
  * Dots stand on the skin above the points that are told, and move with it. A point bears, as large
- * as can be read, the number with which the text of its step begins.
+ * as can be read, the number with which the text of its step begins; behind the probe the number is
+ * seen through it. A click on it is told as "target", with its place.
  */
 
 import { THREE } from "nicegui-scene";
@@ -50,7 +51,7 @@ function take() {
     const radius = target.length > 1 ? DOT : POINT;
     const dots = target.map((at) => ({ point: new THREE.Vector3(...at), radius }));
     const [, name] = (dots.length === 1 && /^(?:point )?(\d+)(?:: |$)/.exec(what)) || [];
-    return { state, dots, number: name && label(name) };
+    return { state, dots, number: name && label(name, dots[0]) };
   });
   boundTo = undefined;
   stage.move();
@@ -69,9 +70,10 @@ function isBehindProbe(at) {
   return hits.some(({ distance }) => distance < way.length());
 }
 
-/** A number in place of a point, over the scene. */
-function label(textContent) {
+/** A number in place of a dot, over the scene. */
+function label(textContent, dot) {
   const made = Object.assign(document.createElement("div"), { className: "us-number", textContent });
+  made.onclick = () => events.tell("target", dot.at.toArray());
   numbers.append(made);
   return made;
 }
@@ -138,8 +140,9 @@ stage.beforeDrawing(() => {
 stage.afterDrawing(() => {
   for (const { dots: [dot], number } of steps) {
     if (!number) continue;
-    number.hidden = !group.visible || !dot.at || isBehindProbe(dot.at);
+    number.hidden = !group.visible || !dot.at;
     if (number.hidden) continue;
+    number.classList.toggle("us-behind", isBehindProbe(dot.at));
     const { x, y } = stage.project(dot.at);
     number.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px)`;
     number.style.zIndex = Math.round(-1e4 * stage.camera.position.distanceTo(dot.at));
