@@ -173,7 +173,8 @@ def test_what_the_scorer_says_is_heard_while_a_page_shows_it(bench, heard):
     publisher = bench.peer.create_publisher(DiagnosticArray, "score", LATCHED)
     pictures = bench.peer.create_publisher(CompressedImage, "score/picture", LATCHED)
     first = DiagnosticStatus(name="Press", message="Press.", values=[KeyValue(key="a", value="1")])
-    target = KeyValue(key="target", value=json.dumps([[0.0, 0.01, 0.02]]))
+    line = [[0.0, 0.01, 0.001 * k] for k in range(300)]
+    target = KeyValue(key="target", value=json.dumps(line))
     wrong = [KeyValue(key="target", value=text) for text in ("[[1, 2]]", "{", '["a"]', "[1e999]")]
     steps = [
         DiagnosticStatus(
@@ -188,7 +189,9 @@ def test_what_the_scorer_says_is_heard_while_a_page_shows_it(bench, heard):
             for each in wrong
         ),
     ]
-    publisher.publish(DiagnosticArray(status=[first, *steps]))
+    changed = "; ".join(f"slice_interpolator.gain = {k} at {k} s" for k in range(50))
+    about = DiagnosticStatus(hardware_id="about", values=[KeyValue(key="changed", value=changed)])
+    publisher.publish(DiagnosticArray(status=[first, *steps, about]))
     pictures.publish(CompressedImage(format="png", data=PNG))
     bench.spin_for(5)
     score, picture = heard.feeds[SCORE], heard.feeds[PICTURE]
@@ -199,7 +202,8 @@ def test_what_the_scorer_says_is_heard_while_a_page_shows_it(bench, heard):
     assert picture.get_newest().payload == PNG
     told = score.get_newest().header
     assert (told["name"], told["description"], told["metrics"]) == ("Press", "Press.", {"a": "1"})
-    missed = {"what": "5 N", "state": "missed", "seen": "2 s", "target": [[0.0, 0.01, 0.02]]}
+    assert told["about"] == {"begun": "", "feedback": "live", "changed": changed}
+    missed = {"what": "5 N", "state": "missed", "seen": "2 s", "target": line}
     assert told["steps"] == [missed, *[{"what": "", "state": "to do", "seen": ""}] * len(wrong)]
     publisher.publish(DiagnosticArray())
     bench.spin_until(lambda: score.sequence == 2)

@@ -69,7 +69,8 @@ def make_score_packet(message: DiagnosticArray, sequence: int) -> Packet:
         "scene": loggable_text(first.hardware_id),
         "state": state,
         "words": STATES[state],
-        "about": {"begun": "", "feedback": "live", **_read_values(about)},
+        "about": {"begun": "", "feedback": "live", **_read_values(about)}
+        | {"changed": _find_value(about, "changed")},
         "plain": _read_values(plain),
         "steps": [_read_step(status) for status in by_kind.get("step", [])],
         "faults": faults,
@@ -96,10 +97,15 @@ def _read_values(status: DiagnosticStatus) -> dict[str, str]:
     return {loggable_text(each.key): loggable_text(each.value) for each in status.values}
 
 
+def _find_value(status: DiagnosticStatus, key: str) -> str:
+    """Return a value, however long: a line has many points, an attempt many changes."""
+    return next((each.value for each in status.values if each.key == key), "")
+
+
 def _read_step(status: DiagnosticStatus) -> dict[str, Any]:
     step = {"what": loggable_text(status.name), "seen": loggable_text(status.message)}
     step["state"] = _STATES.get(status.level, "to do")
-    points = _read_points(_read_values(status).get("target", ""))
+    points = _read_points(_find_value(status, "target"))
     return step | ({"target": points} if points else {})
 
 

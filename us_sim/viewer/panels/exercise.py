@@ -271,8 +271,8 @@ def _name_changed(changes: str) -> str:
     >>> _name_changed("slice_interpolator.gain = 3.0 at 7 s; slice_interpolator.gain = 6.0 at 8 s")
     'gain'
     """
-    parameters = (change.partition(" = ")[0].partition(".")[2] for change in changes.split("; "))
-    return ", ".join(dict.fromkeys(map(format_name, parameters)))
+    settings = [change.partition(" = ")[0].partition(".")[2] for change in changes.split("; ")]
+    return ", ".join(dict.fromkeys(map(format_name, settings)))
 
 
 def _draw_faults(faults: Iterable[Mapping[str, str]]) -> None:

@@ -88,17 +88,19 @@ function bind(points) {
     let top = Infinity;
     dot.corners = undefined;
     for (let t = 0; t < triangles.length; t += 3) {
-      const corners = [3 * triangles[t], 3 * triangles[t + 1], 3 * triangles[t + 2]];
-      const [i, j, k] = corners;
-      const [ax, ay] = [rest[j] - rest[i], rest[j + 1] - rest[i + 1]];
-      const [bx, by] = [rest[k] - rest[i], rest[k + 1] - rest[i + 1]];
+      const i = 3 * triangles[t];
+      const j = 3 * triangles[t + 1];
+      const k = 3 * triangles[t + 2];
+      const ax = rest[j] - rest[i];
+      const ay = rest[j + 1] - rest[i + 1];
+      const bx = rest[k] - rest[i];
+      const by = rest[k + 1] - rest[i + 1];
       const area = ax * by - ay * bx;
       const v = ((x - rest[i]) * by - (y - rest[i + 1]) * bx) / area;
       const w = (ax * (y - rest[i + 1]) - ay * (x - rest[i])) / area;
       if (!(v >= -EDGE && w >= -EDGE && v + w <= 1 + EDGE)) continue; // beside, or upright
-      const weights = [1 - v - w, v, w];
-      const z = corners.reduce((sum, at, n) => sum + weights[n] * rest[at + 2], 0);
-      if (z < top) [top, dot.corners, dot.weights] = [z, corners, weights];
+      const z = (1 - v - w) * rest[i + 2] + v * rest[j + 2] + w * rest[k + 2];
+      if (z < top) [top, dot.corners, dot.weights] = [z, [i, j, k], [1 - v - w, v, w]];
     }
   }
 }
