@@ -73,6 +73,7 @@ function isBehindProbe(at) {
 /** A number in place of a dot, over the scene. */
 function label(textContent, dot) {
   const made = Object.assign(document.createElement("div"), { className: "us-number", textContent });
+  made.hidden = true; // until it is drawn in its place
   made.onclick = () => events.tell("target", dot.at.toArray());
   numbers.append(made);
   return made;
@@ -110,7 +111,9 @@ function placeOf({ point, corners, weights }, points) {
   const place = new THREE.Vector3();
   if (!points || !corners) return place.copy(point);
   const corner = new THREE.Vector3();
-  corners.forEach((at, n) => place.addScaledVector(corner.fromArray(points.positions, at), weights[n]));
+  for (const [n, at] of corners.entries()) {
+    place.addScaledVector(corner.fromArray(points.positions, at), weights[n]);
+  }
   return place;
 }
 
