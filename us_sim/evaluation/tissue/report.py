@@ -48,11 +48,11 @@ def report_tissue(references: pd.DataFrame, points: pd.DataFrame) -> Report:
 def _list_take_home(main: pd.DataFrame, fronts: dict[str, pd.DataFrame]) -> Iterator[str]:
     for p in main[main["default"] & (main["nodes"] == _NODES)].itertuples():
         yield (
-            f"`{p.method}` is {100 * p.rel_l2_error:.2g} % from large deformation "
+            f"`{p.method}` is {100 * p.rel_l2_error:.2g} % off the reference "
             f"({SCENES[MAIN_SCENE].words}, {_NODES:,} nodes), in {p.ms_median:.3g} ms a frame."
         )
     ahead = [f"`{name}`" for name in dict.fromkeys(pd.concat(fronts.values())["method"])]
-    yield f"On the front of error against run time, over all scenes, are only {', '.join(ahead)}."
+    yield f"In some scene the best error for its run time: {', '.join(ahead)}."
 
 
 def _find_pareto_front(points: pd.DataFrame) -> pd.DataFrame:
