@@ -71,11 +71,11 @@ def _report(table: pd.DataFrame) -> Report:
     inverted = frames.groupby("method", sort=False)["inverted"].apply(lambda n: (n > 0).mean())
     linear = _join_frames(brisk[brisk["method"] == "fem"], "every")
     take_home = [
-        f"In a brisk hand on the arm `{JUDGED}` is {every['error'].median():.2g} mm off where it "
-        f"is worst (median frame; {every['error'].quantile(0.99):.2g} mm at the 99th percentile), "
+        f"In a brisk hand on the arm, the worst node of `{JUDGED}` is {every['error'].median():.2g}"
+        f" mm off (median frame; {every['error'].quantile(0.99):.2g} mm at the 99th percentile), "
         f"in {every['cpu'].median():.2g} ms.",
         f"Live, it is {live['error'].median():.2g} mm off, skips {skipped:.2g} % of the poses, and "
-        f"shows nodes {late:.2g} ms after their pose (99th percentile).",
+        f"publishes nodes {late:.2g} ms after their pose (99th percentile).",
         f"`fem` needs {linear['cpu'].median():.2g} ms, and its linear strain is "
         f"{linear['error'].median():.2g} mm off there.",
         "Frames with tetrahedra inside out, all motions: "
