@@ -50,7 +50,7 @@ def report_image(table: pd.DataFrame) -> Report:
             for state in STATES
         ),
         ("image of 512 × 512 with all acoustics, one core", 1.5, ms["all"], "ms"),
-        ("as many times what the slice takes", 1.67, ms["all"] / ms["slice"], ""),
+        ("times the time of the slice", 1.67, ms["all"] / ms["slice"], ""),
         ("strain, likewise", 2.22, ms["strain"] / ms["slice"], ""),
     )
     take_home = [
