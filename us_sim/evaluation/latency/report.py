@@ -54,10 +54,10 @@ def _report(table: pd.DataFrame) -> Report:
         f"`fem_nonlinear`, as in the demo: {image:.3g} and {get_value(DEMO, worst):.3g} ms; of "
         f"these {pose:.2g} ms to the filtered pose, {nodes - pose:.2g} to the tissue and "
         f"{image - nodes:.2g} from there to the image.",
-        f"A hand at 100 mm/s is {get_value(DEMO, 'image_mm_p50'):.2g} mm farther by then.",
-        f"With every core busy with something else, nodes that go first give "
+        f"In that time, a hand at 100 mm/s moves by {get_value(DEMO, 'image_mm_p50'):.2g} mm.",
+        f"With all cores busy with other programs, nodes with priority give "
         f"{get_value(BUSY, 'images_a_second'):.3g} images a second, "
-        f"{get_value(BUSY, worst):.3g} ms at p99.",
+        f"{get_value(BUSY, worst):.3g} ms old at p99.",
     ]
     places = {
         "rows": table.filter(
