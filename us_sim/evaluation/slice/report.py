@@ -105,8 +105,8 @@ def _report(table: pd.DataFrame) -> Report:
         f"less than VTK's filters.",
         f"Every pixel shows the right tissue: {wrong} of {pixels:,} have a wrong coverage, and the "
         f"worst is {ours['max_voxel_error'].max():.1g} voxels off its true place.",
-        f"From 2,000 to 65,536 nodes the time grows {growth:.2g} times; with the pixels as their "
-        f"power {power:g}.",
+        f"From 2,000 to 65,536 nodes the time grows {growth:.2g} times; it grows with the "
+        f"pixels to the power {power:g}.",
     ]
     return Report(take_home, places, targets)
 
