@@ -89,8 +89,8 @@ def report_stability(rows: pd.DataFrame) -> Report:
     failed = int((rows["failure"] != "").sum())
     held = rows[rows["held_residual"].notna()]
     take_home = [
-        f"{len(rows):,} cases, {failed} failed: a tissue that was not finite or bounded, whose "
-        f"residual was not true, that was refused for no reason, or left out of balance."
+        f"{len(rows):,} cases, {failed} failed: a case fails if the tissue is not finite or "
+        f"bounded, reports a wrong residual, is refused for no reason, or stays out of balance."
     ]
     for name, method in TISSUE_METHODS.items():
         own = held[held["method"] == name]
@@ -98,8 +98,8 @@ def report_stability(rows: pd.DataFrame) -> Report:
             balanced = 100 * own["frames_to_1e-3"].notna().mean()
             inverted = int(own["held_inverted"].sum())
             take_home.append(
-                f"`{name}`: in {balanced:.1f} % of {len(own)} cases within anatomy balanced to "
-                f"0.001 under a held probe, in {inverted} with tetrahedra inside out"
+                f"`{name}`: in {balanced:.1f} % of {len(own)} anatomical cases the tissue "
+                f"balanced to 0.001 under a held probe, in {inverted} with tetrahedra inside out"
                 f"{' (which would count as failed)' if method.is_judged_at_rest else ''}."
             )
     ran = rows[~rows["refused"]].assign(softness=0.5 - rows["poisson_ratio"])
