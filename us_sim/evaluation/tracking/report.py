@@ -82,9 +82,9 @@ def _report(table: pd.DataFrame) -> Report:
     take_home = [
         f"A body of six 30 mm markers at 0.4 m before a webcam is {body['mm'].median():.2g} mm and "
         f"{body['degrees'].median():.2g}° off (median), in {ms[SMALL]:.2g} ms of one core.",
-        f"A single 40 mm marker flips to its mirror image in {flips:.2g} % of the views; a hand "
-        f"over a third of it hides it in {100 * (1 - hidden['detected'].mean()):.0f} %, where a "
-        f"body of several is still tracked.",
+        f"A single 40 mm marker flips to its mirror image in {flips:.2g} % of the views. A hand "
+        f"over a third of it hides it in {100 * (1 - hidden['detected'].mean()):.0f} % of them; a "
+        f"body of several markers is still tracked there.",
     ]
     places = {
         "count": f"{len(shots):,}",
