@@ -68,7 +68,7 @@ def report_viewer(table: pd.DataFrame) -> Report:
 
 VIEWER = Subject(
     "viewer",
-    "The viewer: what it costs, and how soon a page shows what one does",
+    "The viewer: cost and delay",
     _plan_pieces,
     report_viewer,
     libraries=("nicegui", "playwright"),
