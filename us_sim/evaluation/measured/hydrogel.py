@@ -238,8 +238,8 @@ def report_hydrogel(rows: pd.DataFrame) -> tuple[str, dict[str, Place]]:
     plain, best = (row for row in whole.iloc[1:].to_dict("records"))
     words = (
         f"Beads in an indented gel: `fem_nonlinear` is {plain['error']:.2f} µm off, and "
-        f"{best['error']:.2f} where the gel softens upwards; they moved by {best['measured']:.1f} "
-        f"and were seen to {best['floor']:.2f} µm."
+        f"{best['error']:.2f} µm if the gel softens upwards. The beads moved by "
+        f"{best['measured']:.1f} µm; their positions are known to {best['floor']:.2f} µm."
     )
     table = whole[["line", "error", "floor"]].assign(ratio=whole["error"] / whole["floor"])
     table.columns = pd.Index(["model", "error, µm", "noise, µm", "ratio"])

@@ -160,8 +160,8 @@ def report_vein(rows: pd.DataFrame) -> tuple[str, dict[str, Place]]:
     scene = rows[rows["panel"] == "moduli of the scene"]
     found = [f"{row.line} {row.predicted:.0f} ({row.measured:.3g})" for row in scene.itertuples()]
     words = (
-        f"A vein closes under the probe at {', '.join(found)} mmHg; in brackets the pressure of a "
-        f"cuff that was published."
+        f"A vein closes under the probe at {', '.join(found)} mmHg; in brackets the published "
+        f"pressure of a cuff."
     )
     columns = ["case", "measured", "predicted", "error"]
     return words, {"vein": figure, "vein_table": rows[columns]}
