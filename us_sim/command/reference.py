@@ -28,9 +28,10 @@ from us_sim.settings.tables import (
 INTRODUCTION = """\
 # Reference
 
-Every topic, every node parameter and every key of a scene, with its range and default. This page
-is made from the code: `us-sim reference --out docs/reference.md` writes it, and a test compares
-them. `us-sim reference tissue` prints a part of it: `topics`, a node's name, or a key of a scene.
+Every topic, every node parameter and every key of a scene, with its range and default. The command
+`us-sim reference --out docs/reference.md` writes this page from the code; `us-sim reference tissue`
+prints one part: `topics`, a node, or a key of a scene. Read a description after its name: `depth`
+… of the image.
 
 - [Topics](#topics)
 - [Node parameters](#node-parameters)
@@ -38,25 +39,24 @@ them. `us-sim reference tissue` prints a part of it: `topics`, a node's name, or
 """
 
 TOPICS_TEXT = """\
-Names are relative to the simulator's namespace. A message that comes from a pose carries that
-pose's stamp, so `now - stamp` is its age anywhere in the graph. Topics are published reliable, the
-last 10 kept; those marked latched are kept for subscribers that come later (transient local, the
-last 1). Devices are heard best effort. History, depth and reliability are parameters,
-`qos_overrides.…`, of each. `session_recorder` subscribes to all topics that it is not told to leave
-out; `session_player` publishes all of a recording; `session_monitor` is `us-sim` itself."""
+Names are relative to the simulator's namespace. Publishers are reliable and keep the last 100
+messages; latched topics keep the last one for later subscribers (transient local). Nodes hear
+drivers best effort. The parameters `qos_overrides.…` of each node change history, depth and
+reliability. `session_recorder` subscribes to all topics except excluded ones; `session_player`
+publishes all of a recording; `session_monitor` is `us-sim` itself."""
 
 PARAMETERS_TEXT = """\
-A parameter of a running node is set with `ros2 param set /tissue_deformer solver msds` where "while
-running" says yes; others are given at the start: `--ros-args -p name:=value`, or
-`us-sim run SCENE --param NODE.NAME=VALUE`. Values are in SI units (m, s, Pa, rad); `--param` takes
-units, too (`40 mm`). A parameter has no value for nothing: none is 0 for a number, and '' for a
-text. ROS 2's own commands need a decimal point in a number that may be a fraction (`6.0`)."""
+`ros2 param set /tissue_deformer solver msds` sets a parameter of a running node where "while
+running" says yes; set others at the start: `--ros-args -p name:=value`, or
+`us-sim run SCENE --param NODE.NAME=VALUE`. Values are in SI units (m, s, Pa, rad); `--param` also
+takes units (`40 mm`). For *none*, set 0 (a number) or '' (a text). ROS 2's own commands need a
+decimal point in a number that may be a fraction (`6.0`)."""
 
 SCENE_TEXT = """\
-A scene is a YAML file. Only `name`, `volume` and `probe` must be there; what it does not name costs
+A scene is a YAML file. It must have `name`, `volume` and `probe`; what it does not name costs
 nothing. Numbers are in SI units (m, s, Pa, rad) or carry a unit (`40 mm`, `12 kPa`, `30 deg`).
-Relative files are looked up beside the scene's own file. `based_on: OTHER` takes everything from
-another scene, by file or name, that this one does not say. `tissue.mesh.nodes` is the key `nodes`
+Relative files are beside the scene's own file. `based_on: OTHER` takes what this scene does not
+give from another one, a file or a name. `tissue.mesh.nodes` is the key `nodes`
 in `mesh` in `tissue`; `NAME` stands for a name of your choice."""
 
 POSE = "A pose"
@@ -172,7 +172,7 @@ def _make_node_sections() -> Iterator[Section]:
     for node, settings in NODES.items():
         text = []
         if SceneNodeSettings in settings:
-            text.append(f"Those of [every node that works on a scene](#{make_anchor(common)}).")
+            text.append(f"Also the [common parameters](#{make_anchor(common)}).")
         for each in settings:
             if each is Imaging:
                 live = _list_live_of_probes()
@@ -184,7 +184,7 @@ def _make_node_sections() -> Iterator[Section]:
         if node in _OF_THE_SCENE:
             keys = _OF_THE_SCENE[node].items()
             links = ", ".join(f"{key} of [{title}](#{make_anchor(title)})" for key, title in keys)
-            text.append(f"While running, with the scene's defaults, where it names them: {links}.")
+            text.append(f"While running, for what the scene names, with its defaults: {links}.")
         yield Section(node, node, "\n\n".join(text))
 
 

@@ -65,9 +65,9 @@ class RoundedBox(_Shape):
         array([0.019, 0.009, 0.019, 0.006])
     """
 
-    length: float = setting(_SIZE, "along the probe's x, over everything")
-    width: float = setting(_SIZE, "along the probe's y, over everything")
-    height: float = setting(_SIZE, "along the probe's z, over everything")
+    length: float = setting(_SIZE, "total along the probe's x")
+    width: float = setting(_SIZE, "total along the probe's y")
+    height: float = setting(_SIZE, "total along the probe's z")
     rounding: float = setting(_ROUNDING, "radius of edges and corners")
 
     def check(self) -> None:

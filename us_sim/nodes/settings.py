@@ -44,24 +44,23 @@ class AnnotatedImageSettings(Settings):
     live = True
 
     stale_after: float = setting(
-        _AGE, "without a new pose before the image is marked stale", default=0.5
+        _AGE, "time without a new pose after which the image is stale", default=0.5
     )
     lost_after: float = setting(
-        _AGE, "without a new pose before the probe counts as lost", default=2.0
+        _AGE, "time without a new pose after which the probe is lost", default=2.0
     )
     overlay: str = setting(
-        description="colours over the annotated image, where the scene can provide them",
+        description="colours over the annotated image, if the scene has their source",
         choices=(*OVERLAYS, "none"),
         default="none",
     )
     flip: bool = setting(
-        description="left and right exchanged in the annotated image and on the page: the probe's "
-        "mark is at the right then",
+        description="exchange left and right in the annotated image and on the page: the probe's "
+        "mark is then at the right",
         default=False,
     )
     beside: bool = setting(
-        description="the image without anything over it at the left of the annotated one, of the "
-        "same moment",
+        description="show the plain image of the same moment at the left of the annotated one",
         default=False,
     )
 
@@ -88,20 +87,18 @@ class PlayerSettings(Settings):
     rate: float = setting(_SPEED, "speed factor", default=1.0, live=True)
     loop: bool = setting(description="start again at the end", default=False, live=True)
     paused: bool = setting(
-        description="stay there: the probe is held, nothing else is published; not in lockstep",
+        description="hold the probe, and publish nothing else; not in lockstep",
         default=False,
         live=True,
     )
-    time: float = setting(
-        _SPAN, "from the start, where to play on each time this is set", default=0.0, live=True
-    )
+    time: float = setting(_SPAN, "from the start: setting it jumps there", default=0.0, live=True)
     clock: float = setting(
         Quantity("frequency", 0.0, 1000.0),
-        "of `/clock`, which tells the time of the recording; poses have its stamps then; 0: none",
+        "rate of the recording's time on `/clock`; poses are then stamped with it; 0: no `/clock`",
         default=0.0,
     )
     stay: bool = setting(
-        description="wait at the end until `time` is set, holding the probe; else end there",
+        description="at the end, hold the probe until `time` is set; else the node ends",
         default=False,
     )
 
@@ -111,21 +108,21 @@ class PathPlayerSettings(PlayerSettings):
     """Parameters of ``path_player``."""
 
     topic: str | None = setting(
-        description="in the bag; not given: the only one of PoseStamped", default=None
+        description="of the poses in the bag; not given: the only PoseStamped topic", default=None
     )
     lockstep: bool = setting(
-        description="send the next pose when the image of the last has come", default=False
+        description="send each pose after the image of the one before", default=False
     )
     await_topics: tuple[str, ...] = setting(
-        description="begin when each of these has a publisher", default=()
+        description="topics: begin when each has a publisher", default=()
     )
     await_recorded: tuple[str, ...] = setting(
-        description="and session_recorder subscribes to each of these", default=()
+        description="topics: begin when session_recorder subscribes to each", default=()
     )
     begun: float = setting(
         Quantity("time", 0.0, 1e10),
-        "since 1970, when the first pose was sent: play on where the path would be by now; 0: from "
-        "the start",
+        "time of the first pose since 1970, to play on where the path would be by now; 0: from the "
+        "start",
         default=0.0,
     )
 
@@ -145,8 +142,8 @@ class SessionRecorderSettings(Settings):
         description="MCAP file to write, or a new folder for a bag", default="session.mcap"
     )
     if_exists: str = setting(
-        description="a recording of that name that is there already: refuse to start, or go on in "
-        "a further file beside it",
+        description="if a recording of that name exists: refuse to start, or go on in a further "
+        "file beside it",
         choices=("refuse", "further"),
         default="refuse",
     )
@@ -154,40 +151,40 @@ class SessionRecorderSettings(Settings):
         description="of the file's chunks", choices=("none", "zstd"), default="none"
     )
     topics: tuple[str, ...] = setting(
-        description="names, in this node's namespace or from `/` on; none: all of the namespace, "
-        "but no other simulator's and none made on demand",
+        description="to record, by names in this namespace or from `/`; none: all of the "
+        "namespace except those on demand and those of other simulators",
         default=(),
     )
     also: tuple[str, ...] = setting(
-        description="names of topics that are recorded beside these: made on demand, such as "
-        "tissue/structures, or outside the namespace",
+        description="more topics to record: those on demand, such as tissue/structures, or outside "
+        "the namespace",
         default=(),
     )
-    exclude: tuple[str, ...] = setting(description="names to leave out", default=())
+    exclude: tuple[str, ...] = setting(description="topics to leave out", default=())
     max_cache_size: int = setting(
         Quantity("number", 0, 2**53),
-        "bytes of messages that may wait for the disk; 0: whoever publishes in this process waits",
+        "bytes of messages that may wait for the disk; 0: publishers in this process wait",
         default=100 * 1024 * 1024,
     )
     paused: bool = setting(
-        description="record nothing, but keep the newest of latched messages for when it goes on",
+        description="record nothing, but keep the newest latched messages until it goes on",
         default=False,
         live=True,
     )
     scene: str | None = setting(
-        description="scene that is recorded, to be attached with the files that it names",
+        description="recorded scene, to attach with the files that it names",
         default=None,
     )
     volume: str | None = setting(
         description="volume file in place of the scene's", default=None, file=True
     )
     path: str | None = setting(
-        description="bag or tracker recording that is played in place of the scene's path",
+        description="bag or tracker recording played in place of the scene's path",
         default=None,
         file=True,
     )
     parameters: str = setting(
-        description="those of all nodes, as YAML: attached as parameters.yaml", default=""
+        description="of all nodes, as YAML, to attach as parameters.yaml", default=""
     )
     attach: tuple[str, ...] = setting(description="more files to attach", default=())
 
@@ -216,33 +213,31 @@ class SessionControlSettings(Settings):
     live = True
 
     scene: str = setting(
-        description="scene file, name of an installed one, or `case:NAME`; setting it, also to "
-        "what it is, loads it",
+        description="scene file, name of an installed one, or `case:NAME`; each setting, also of "
+        "the same text, loads it",
         default="upper_arm",
     )
     volume: str | None = setting(
-        description="volume file in place of the scene's; of no other scene than it is set with",
+        description="volume file in place of the scene's; only for the scene set with it",
         default=None,
     )
     record: str | None = setting(
         description="new MCAP file to record to; none ends the recording", default=None
     )
     replay: str | None = setting(
-        description="bag to play; setting it to what it is plays it from its start; none ends it",
+        description="bag to play; setting the same again plays from the start; none ends it",
         default=None,
     )
     replay_as: str = setting(
-        description="path: the probe moves as recorded; recording: all recorded topics are "
-        "published in place of the simulation, which goes on afterwards",
+        description="path: the probe moves as recorded; recording: all recorded topics replace "
+        "the simulation, which goes on afterwards",
         choices=("path", "recording"),
         default="path",
     )
     replay_rate: float = setting(_SPEED, "speed factor", default=1.0)
     replay_loop: bool = setting(description="start again at the end", default=False)
-    replay_paused: bool = setting(description="hold it where it is", default=False)
-    replay_time: float = setting(
-        _SPAN, "from the start, where to play on each time this is set", default=0.0
-    )
+    replay_paused: bool = setting(description="hold the replay", default=False)
+    replay_time: float = setting(_SPAN, "from the start: setting it jumps there", default=0.0)
 
 
 _MARKERS = Quantity("frequency", 0.1, 1000.0)
@@ -259,9 +254,9 @@ class SceneNodeSettings(Settings):
     lockstep: bool = setting(
         description="work on every message, in order, instead of the newest", default=False
     )
-    threads: int = setting(Quantity("number", 1, 256), "for the numerical work", default=1)
+    threads: int = setting(Quantity("number", 1, 256), "of numerical work", default=1)
     realtime: bool = setting(
-        description="go before ordinary programs, where the system allows that; not in lockstep",
+        description="priority over ordinary programs, if the system allows it; not in lockstep",
         default=True,
     )
 
@@ -274,7 +269,7 @@ class ProbeTrackerSettings(Settings):
         description="replaces tracker.source of the scene", choice=TRACKERS, default=None
     )
     filter: str = setting(
-        description="of the poses; in place of tracker.filter.method of the scene",
+        description="of the poses; replaces tracker.filter.method of the scene",
         choice=FILTERS,
         default="none",
         live=True,
@@ -283,7 +278,7 @@ class ProbeTrackerSettings(Settings):
 
 @dataclass(frozen=True)
 class TissueDeformerSettings(Settings):
-    """Parameters of ``tissue_deformer``, beside those of the solvers and of the materials."""
+    """Parameters of ``tissue_deformer``."""
 
     live = True
 
@@ -291,7 +286,7 @@ class TissueDeformerSettings(Settings):
         description="method that deforms the tissue", choice=SOLVERS, default="fem"
     )
     compare_with: str | None = setting(
-        description="another method, which runs on the same poses beside it",
+        description="second method, which runs on the same poses",
         choice=SOLVERS,
         default=None,
     )
@@ -309,11 +304,11 @@ class StructureMarkersSettings(Settings):
     """Parameters of ``tissue_deformer`` where the scene has structures."""
 
     marker_rate: float = setting(
-        _MARKERS, "markers of the structures are sent at most", default=20.0, live=True
+        _MARKERS, "highest rate of the structures' markers", default=20.0, live=True
     )
     structure_triangles: int = setting(
         Quantity("number", 100, 10_000_000),
-        "about so many for all structures around labels together",
+        "approximate number for all structures around labels",
         default=40_000,
     )
 
@@ -322,10 +317,10 @@ class StructureMarkersSettings(Settings):
 class SkinDeformerSettings(Settings):
     """Parameters of ``skin_deformer``."""
 
-    marker_rate: float = setting(_MARKERS, "markers are sent at most", default=20.0, live=True)
+    marker_rate: float = setting(_MARKERS, "highest rate of markers", default=20.0, live=True)
     marker_opacity: float = setting(
         Quantity("number", 0.0, 1.0),
-        "of the skin's markers, 1 hides what lies below",
+        "of the skin's markers; 1 hides what lies below",
         default=0.6,
         live=True,
     )
@@ -335,7 +330,7 @@ class SkinDeformerSettings(Settings):
 class ImageWriterSettings(Settings):
     """Parameters of ``image_writer``."""
 
-    folder: str = setting(description="where the PNG files go", default="images")
+    folder: str = setting(description="for the PNG files", default="images")
     labels: str | None = setting(
         description="folder for the labels of each image, as PNG files; none: not written",
         default=None,
@@ -361,7 +356,7 @@ class CameraDriverSettings(Settings):
     encoding: str = setting(description="of the images", choices=("mono8", "bgr8"), default="mono8")
     rate: float = setting(
         Quantity("frequency", 0.0, 1e3),
-        "images, asked of a camera, or in place of a file's own; 0: as it is",
+        "of images, for a camera or instead of a file's own; 0: as it is",
         default=0.0,
     )
     loop: bool = setting(description="start a file again at its end", default=False)
@@ -387,13 +382,13 @@ class OpenIGTLinkBridgeSettings(Settings):
     """Parameters of ``openigtlink_bridge``."""
 
     host: str | None = setting(
-        description="address to listen at; none: all of this computer", default="localhost"
+        description="address to listen at; none: all of this computer's", default="localhost"
     )
     port: int = setting(
         Quantity("number", 0, 65535), "TCP port; 0 is any that is free", default=18944
     )
     reference: str = setting(
-        description="frame that images lie in: the volume file's own, or patient",
+        description="frame of the images: the volume file's own, or patient",
         choices=("volume", "patient"),
         default="volume",
     )
@@ -409,24 +404,24 @@ class ScorerSettings(Settings):
     )
     student: str = setting(description="name that results bear", default="")
     results: str | None = setting(
-        description="folder, or address of fsspec, to which each result is written",
+        description="folder, or address of fsspec, for each result",
         default=None,
     )
     answers: tuple[str, ...] = setting(
-        description="of the learner, where an exercise asks, for each point: compressible, not "
+        description="of the student, if the exercise asks, for each point: compressible, not "
         "compressible, not seen, or - for none yet",
         default=(),
         live=True,
     )
     thrombus: str = setting(
-        description="likewise, where it is: the number of a point at it, or none; empty for no "
+        description="the student's answer: the number of a point at it, or none; empty for no "
         "answer yet",
         default="",
         live=True,
     )
     begun: float = setting(
         Quantity("time", 0.0, 1e10),
-        "since 1970, when an attempt began that a killed scorer forgot: this one is void; 0: none",
+        "start (since 1970) of the attempt that a killed scorer lost, now void; 0: none",
         default=0.0,
     )
 

@@ -97,7 +97,7 @@ class EpisodeSettings(Settings):
         default="twist",
     )
     force: float = setting(
-        Quantity("force", 0.1, 200.0), "wanted at an action of 1, none at -1", default=20.0
+        Quantity("force", 0.1, 200.0), "wanted at an action of 1; none at -1", default=20.0
     )
     force_error: float = setting(
         Quantity("force", 0.01, 200.0),
@@ -105,15 +105,15 @@ class EpisodeSettings(Settings):
         default=8.0,
     )
     aside: float = setting(
-        Quantity("length", 0.0, 1.0), "farthest way from the scene's start along x, y", default=0.02
+        Quantity("length", 0.0, 1.0), "farthest from the scene's start along x, y", default=0.02
     )
-    lift: float = setting(Quantity("length", 0.0, 1.0), "highest place above it", default=0.01)
-    press: float = setting(Quantity("length", 0.0, 0.2), "deepest place below it", default=0.016)
+    lift: float = setting(Quantity("length", 0.0, 1.0), "highest above it", default=0.01)
+    press: float = setting(Quantity("length", 0.0, 0.2), "deepest below it", default=0.016)
     lean: float = setting(
         Quantity("angle", 0.0, 1.5), "farthest turn from the scene's start", default=0.6
     )
     observe: tuple[str, ...] = setting(
-        description=f"entries of an observation: {', '.join(OBSERVABLE)}",
+        description="entries of an observation",
         choices=OBSERVABLE,
         default=("image", "pose", "wrench", "contact"),
     )

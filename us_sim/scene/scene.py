@@ -135,7 +135,7 @@ class TrackerSettings(Settings):
         applies=("source", ("tf", "openigtlink", "path")),
     )
     file: str | None = setting(
-        description="bag, or tracker recording of PLUS",
+        description="bag, or tracker recording of Plus",
         default=None,
         file=True,
         applies=("source", ("path",)),
@@ -146,23 +146,23 @@ class TrackerSettings(Settings):
         file=True,
     )
     calibration: Placement | str | None = setting(
-        description="the probe in the tracked body's frame: likewise", default=None, file=True
+        description="the probe in the tracked body's frame, likewise", default=None, file=True
     )
     time_offset: float = setting(
         Quantity("time", -10.0, 10.0), "added to the stamps of the poses", default=0.0
     )
     coast_for: float = setting(
         Quantity("time", 1e-3, 60.0),
-        "without a pose after which the probe is `coasting`",
+        "time without a pose after which the probe is `coasting`",
         default=0.3,
     )
     lost_after: float = setting(
-        Quantity("time", 1e-3, 60.0), "without a pose after which it is `lost`", default=1.0
+        Quantity("time", 1e-3, 60.0), "time without a pose after which it is `lost`", default=1.0
     )
     filter: ChosenOption = setting(
         description="what smooths the poses", choice=FILTERS, default=ChosenOption("none")
     )
-    gate: GateSettings | None = setting(description="which poses are not believed", default=None)
+    gate: GateSettings | None = setting(description="which poses are refused", default=None)
 
     def check(self) -> None:
         """Require that a probe coasts before it is lost."""
@@ -194,7 +194,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Scene(Settings):
-    """A whole scene. Only ``name``, ``volume`` and ``probe`` must be there.
+    """A whole scene.
 
     Examples:
         >>> from us_sim.scene.reading import load_scene

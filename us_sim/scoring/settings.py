@@ -30,10 +30,10 @@ NO_THROMBUS = "none"
 
 @dataclass(frozen=True)
 class ScoreSettings(Settings):
-    """The limit that metrics of force are about."""
+    """The limit of force for the metrics."""
 
     error: ClassVar = ScoreError
 
     force_limit: float = setting(
-        Quantity("force", 0.01, 1000.0), "of which the time above it is told", default=10.0
+        Quantity("force", 0.01, 1000.0), "the metrics give the time above it", default=10.0
     )

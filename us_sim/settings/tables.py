@@ -8,7 +8,7 @@
 | `young_modulus` | 0.001 Pa to 10000 GPa | needed | Young's modulus |
 | `poisson_ratio` | -0.99 to 0.49999 | 0.45 | Poisson's ratio |
 | `density` | 0.001 to 1000000 kg/m3 | 1000 kg/m3 | mass per volume |
-| `lumen_pressure` | 1 Pa to 100 kPa | none | of a vessel's blood, which leaves if pressed by more |
+| `lumen_pressure` | 1 Pa to 100 kPa | none | of a vessel's blood, which leaves under more |
 >>> from us_sim.scene.scene import TissueSettings
 >>> [section.title for section in make_sections(TissueSettings, "tissue")][:3]
 ['tissue', 'tissue.mesh', 'tissue.mesh.pose']
@@ -89,13 +89,13 @@ def describe_values(kind: Any, rule: SettingRule) -> str:
         options = [option for option in get_args(kind) if option is not type(None)]
         return ", or ".join(describe_values(option, rule) for option in options)
     if kind is bool:
-        return "true or false"
+        return "true/false"
     if kind is str:
         names = rule.choice.names if rule.choice else rule.choices
         return _format_names(names) if names else ("file" if rule.file else "text")
     if kind in (int, float):
         numbers = format_range(rule.quantity) if rule.quantity else "number"
-        return f"whole number {numbers}" if kind is int else numbers
+        return f"integer {numbers}" if kind is int else numbers
     if get_origin(kind) is tuple:
         kinds = get_args(kind)
         count = "" if kinds[-1] is Ellipsis else f"{len(kinds)}, each "
@@ -193,7 +193,7 @@ def _format_default(value: Any, rule: SettingRule) -> str:
         return f"[{', '.join(_format_default(item, rule) for item in value)}]"
     if isinstance(value, str | ChosenOption):
         return f"`{getattr(value, 'name', value)}`"
-    return "its own defaults"
+    return "see keys"
 
 
 def _format_names(names: Iterable[str]) -> str:

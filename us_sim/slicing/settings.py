@@ -143,12 +143,12 @@ class StrainSettings(Settings):
     since: str = setting(
         default="rest",
         choices=("rest", "image"),
-        description="what the tissue's own strain counts from: the tissue at rest, or the image "
-        "that the estimate is compared with, too",
+        description="from which the tissue's own strain counts: rest, or the image that the "
+        "estimate uses",
     )
     interval: int = setting(
         Quantity("number", 1, 60),
-        "images from one to the one it is compared with; a slow press needs several",
+        "images between the two compared; a slow press needs several",
         default=2,
     )
     colours: float | None = setting(
@@ -158,22 +158,22 @@ class StrainSettings(Settings):
     )
     window: float = setting(
         _LENGTH,
-        "along the beam, of what is found again in the other image; a third of it across",
+        "of a tracked window along the beam; a third of it across",
         default=3e-3,
     )
     search: float = setting(
         Quantity("length", 0.05e-3, 0.02),
-        "along the beam, how far it is looked for",
+        "farthest that a window is searched along the beam",
         default=0.6e-3,
     )
     fit: float = setting(
         _LENGTH,
-        "along the beam, of the line that is fitted to displacement, whose slope is the strain",
+        "of the line fitted to the displacement, whose slope is the strain",
         default=6e-3,
     )
     correlation: float = setting(
         Quantity("number", 0.0, 1.0),
-        "of what was found with what was looked for: the least that is used",
+        "of a window with its match: the lowest that is used",
         default=0.7,
     )
 
@@ -188,7 +188,7 @@ class MModeSettings(Settings):
 
     lateral: float = setting(
         Quantity("number", -0.5, 0.5),
-        "of the line across the face, or the opening angle, as a fraction of that",
+        "of the line, as a fraction of the face or the opening angle",
         default=0.0,
     )
     sweep: float = setting(Quantity("time", 0.5, 20.0), "that the picture shows", default=4.0)
@@ -224,7 +224,7 @@ class FlowSettings(Settings):
     )
     direction: tuple[float, float, float] = setting(
         Quantity("number", -1.0, 1.0),
-        "whereto blood flows, as x, y and z in `patient`; roughly, the vessel says the rest",
+        "in which blood flows, x, y, z in `patient`; approximately",
     )
     peak_velocity: float = setting(
         Quantity("speed", 0.01, 5.0),
@@ -237,20 +237,19 @@ class FlowSettings(Settings):
     respiration_rate: float = setting(_RATE, "breaths: `15 /min`", default=0.25, applies=_VENOUS)
     pressure: float | None = setting(
         _PRESSURE,
-        "mean in the vessel at rest, over that where its blood goes; not given: 12.4 kPa arterial, "
-        "1 kPa venous",
+        "mean at rest, above that downstream; not given: 12.4 kPa arterial, 1 kPa venous",
         default=None,
     )
     bed_pressure: float = setting(
         Quantity("pressure", 1e3, 40e3),
-        "mean of the capillaries, to which a vein fills up behind a closure; over that in the vein "
-        "it is how many times the flow at rest the surge begins with",
+        "mean in the capillaries, up to which a closed vein fills; divided by the vein's pressure, "
+        "it is the ratio of the first surge to the flow at rest",
         default=3.3e3,
         applies=_VENOUS,
     )
     filling_time: float = setting(
         Quantity("time", 0.05, 120.0),
-        "constant of the filling behind a closure",
+        "time constant of the filling behind a closure",
         default=6.0,
         applies=_VENOUS,
     )
@@ -299,25 +298,23 @@ class DopplerSettings(Settings):
 
     lateral: float = setting(
         Quantity("number", -0.5, 0.5),
-        "of the middle across the face, or the opening angle, as a fraction of that",
+        "of the middle, as a fraction of the face or the opening angle",
         default=0.0,
     )
     depth: float | None = setting(
         Quantity("length", 1e-3, 0.4), "of the middle; not given: the image's middle", default=None
     )
-    follow: bool = setting(
-        description="keep the middle on the vessel nearest to it in the image", default=False
-    )
+    follow: bool = setting(description="keep the middle on the nearest vessel", default=False)
     steering: float = setting(
         Quantity("angle", math.radians(-30), math.radians(30)),
         "of the beams towards +x of the probe; linear probes only",
         default=0.0,
     )
     nyquist_velocity: float = setting(
-        Quantity("speed", 0.01, 5.0), "along the beam, at which velocities turn over", default=0.3
+        Quantity("speed", 0.01, 5.0), "along the beam, at which velocities alias", default=0.3
     )
     wall_filter: float = setting(
-        Quantity("speed", 0.0, 0.2), "along the beam, of what is halved as tissue", default=0.015
+        Quantity("speed", 0.0, 0.2), "along the beam, at which echoes are halved", default=0.015
     )
     gain: float = setting(Quantity("level", -30.0, 30.0), "of the blood's echoes", default=0.0)
 
@@ -339,7 +336,7 @@ class ColourSettings(DopplerSettings):
 
     width: float = setting(
         Quantity("number", 0.02, 1.0),
-        "of the box across the face, or the opening angle, as a fraction of that",
+        "of the box, as a fraction of the face or the opening angle",
         default=0.5,
     )
     height: float | None = setting(
@@ -354,7 +351,7 @@ class ColourSettings(DopplerSettings):
         Quantity("length", 0.0, 5e-3), "full width at half maximum", default=0.6e-3
     )
     persistence: float = setting(
-        Quantity("number", 0.0, 0.95), "weight of the frames before", default=0.3
+        Quantity("number", 0.0, 0.95), "weight of earlier frames", default=0.3
     )
 
 
@@ -374,7 +371,7 @@ class SpectrumSettings(DopplerSettings):
     )
     baseline: float = setting(
         Quantity("number", -0.9, 0.9),
-        "of 0 m/s: by which fraction of the Nyquist velocity it is moved down",
+        "how far 0 m/s is moved down, as a fraction of the Nyquist velocity",
         default=0.0,
     )
     dynamic_range: float = setting(

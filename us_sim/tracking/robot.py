@@ -73,36 +73,34 @@ class RobotSettings(Settings):
 
     error = TrackingError
 
-    rate: float = setting(
-        Quantity("frequency", 1.0, 1000.0), "poses, and steps of the control", default=60.0
-    )
+    rate: float = setting(Quantity("frequency", 1.0, 1000.0), "of poses and control", default=60.0)
     damping: float = setting(
         Quantity("number", 1.0, 1e6),
-        "N s/m of the admittance along the probe's axis; for contact without overshoot at least "
-        "2.7 times the tissue's stiffness (N/m) times the delay of its force (s)",
+        "N s/m, of the admittance along the probe's axis; without overshoot from 2.7 times the "
+        "tissue's stiffness (N/m) times the delay of its force (s)",
         default=400.0,
     )
-    force: float = setting(Quantity("force", 0.1, 200.0), "largest that is sought", default=25.0)
+    force: float = setting(Quantity("force", 0.1, 200.0), "largest wanted force", default=25.0)
     timeout: float = setting(
         Quantity("time", 0.01, 60.0),
-        "after which a command counts no longer, and the arm stops; likewise a felt force",
+        "after which a command or a felt force counts no longer, and the arm stops",
         default=0.3,
     )
     speed: float = setting(Quantity("speed", 1e-4, 2.0), "highest of the probe", default=0.05)
-    angular_speed: float = setting(Quantity("angular speed", 1e-3, 10.0), "likewise", default=0.6)
+    angular_speed: float = setting(Quantity("angular speed", 1e-3, 10.0), "highest", default=0.6)
     acceleration: float = setting(
         Quantity("number", 0.01, 1000.0), "highest of the probe, m/s²", default=1.0
     )
     angular_acceleration: float = setting(
-        Quantity("number", 0.01, 1e4), "likewise, rad/s²", default=10.0
+        Quantity("number", 0.01, 1e4), "the highest, rad/s²", default=10.0
     )
     aside: float = setting(
-        Quantity("length", 0.0, 2.0), "farthest way from the scene's start along x, y", default=0.1
+        Quantity("length", 0.0, 2.0), "farthest from the scene's start along x, y", default=0.1
     )
     lift: float = setting(
-        Quantity("length", 0.0, 2.0), "highest place above it, where the arm begins", default=0.02
+        Quantity("length", 0.0, 2.0), "highest above it, where the arm begins", default=0.02
     )
-    press: float = setting(Quantity("length", 0.0, 0.2), "deepest place below it", default=0.025)
+    press: float = setting(Quantity("length", 0.0, 0.2), "deepest below it", default=0.025)
     lean: float = setting(
         Quantity("angle", 0.0, 1.5), "farthest turn from the scene's start", default=0.6
     )

@@ -34,7 +34,7 @@ MARKER_SIZE = Quantity("length", 1e-3, 0.25)
 
 @dataclass(frozen=True)
 class CameraSettings(Settings):
-    """The settings of the camera source. Each is a key of a scene's ``tracker.camera:``."""
+    """The camera source: which markers are on the probe."""
 
     section = "camera"
     error = TrackingError
@@ -48,7 +48,7 @@ class CameraSettings(Settings):
         description="of the one marker", choices=DICTIONARIES, default="4X4_50"
     )
     minimum_markers: int = setting(
-        Quantity("number", 1, 1000), "markers that must be seen for a pose to be taken", default=1
+        Quantity("number", 1, 1000), "fewest visible markers for a pose", default=1
     )
 
 
@@ -57,7 +57,7 @@ _CUTOFF = Quantity("frequency", 1e-3, 1e3)
 
 @dataclass(frozen=True)
 class OneEuroSettings(Settings):
-    """The settings of the One-Euro filter; each is a key of ``tracker.filter``.
+    """The settings of the One-Euro filter.
 
     The defaults suit a hand-held probe: at rest the filter takes away most of what trembles above
     1.5 Hz, and in a sweep of 0.1 m/s it lags by 8 ms.
@@ -84,7 +84,7 @@ class OneEuroSettings(Settings):
 
 @dataclass(frozen=True)
 class KalmanSettings(Settings):
-    """The settings of the constant-velocity Kalman filter; each is a key of ``tracker.filter``."""
+    """The settings of the constant-velocity Kalman filter."""
 
     section = "filter"
     error = TrackingError
@@ -92,30 +92,29 @@ class KalmanSettings(Settings):
 
     acceleration: float = setting(
         Quantity("acceleration noise", 1e-6, 1e4),
-        "standard deviation of the change of the speed within a second; within a time "
-        "t it is the root of t times as much",
+        "standard deviation of the speed's change within a second; it grows with the root of time",
         default=0.05,
     )
     angular_acceleration: float = setting(
         Quantity("angular acceleration noise", 1e-6, 1e5),
-        "the same of the angular speed",
+        "likewise of the angular speed",
         default=0.5,
     )
     position_deviation: float = setting(
         Quantity("length", 1e-9, 0.1),
-        "standard deviation of each coordinate of a pose that comes without covariance",
+        "standard deviation of each coordinate of a pose without covariance",
         default=3e-4,
     )
     rotation_deviation: float = setting(
         Quantity("angle", 1e-9, 1.0),
-        "standard deviation about each axis of a pose that comes without covariance",
+        "standard deviation about each axis of a pose without covariance",
         default=5e-3,
     )
 
 
 @dataclass(frozen=True)
 class GateSettings(Settings):
-    """The settings of the gate that refuses poses; each is a key of ``tracker.gate``."""
+    """The gate, which refuses poses that are too far from the last one."""
 
     section = "gate"
     error = TrackingError
@@ -128,24 +127,24 @@ class GateSettings(Settings):
     )
     jump: float = setting(
         Quantity("length", 0.0, 1.0),
-        "distance between two poses that is allowed beside what the speed allows: a pose's noise",
+        "distance between two poses allowed in addition to the speed's: a pose's noise",
         default=5e-3,
     )
     rotation_jump: float = setting(
         Quantity("angle", 0.0, math.pi),
-        "turn between two poses that is allowed beside what the angular speed allows",
+        "turn between two poses allowed in addition to the angular speed's",
         default=math.radians(5),
     )
     accept_after: int = setting(
         Quantity("number", 2, 10_000),
-        "so many refused poses in a row that agree with each other are the new place",
+        "refused poses in a row that agree with each other, after which they are accepted",
         default=5,
     )
 
 
 @dataclass(frozen=True)
 class HapticSettings(Settings):
-    """The settings of a haptic arm; each is a key of a scene's ``tracker.haptic:``.
+    """The settings of a haptic arm.
 
     The defaults suit a small desktop arm that gives 3 N at most and no torque.
     """
@@ -181,7 +180,7 @@ class HapticSettings(Settings):
     )
     hand_over: float = setting(
         Quantity("time", 1e-3, 1.0),
-        "time for the change from one model of the contact to the next",
+        "time for the change from one contact model to the next",
         default=0.03,
     )
     pose_timeout: float = setting(
@@ -191,7 +190,7 @@ class HapticSettings(Settings):
     )
     model_timeout: float = setting(
         Quantity("time", 5e-3, 5.0),
-        "age of the model of the contact from which on the wrench is zero",
+        "age of the contact model after which the wrench is zero",
         default=0.3,
     )
 
@@ -202,7 +201,7 @@ _BUTTON = Quantity("number", -1, 63)
 
 @dataclass(frozen=True)
 class SixDofMouseSettings(Settings):
-    """The settings of the 6-DOF mouse; each is a key of a scene's ``tracker.six_dof_mouse:``.
+    """The settings of a 6-DOF mouse.
 
     The deflection is the probe's velocity; a full one is 1. The signs of the defaults turn the axes
     of REP 103, in which mice report (x forward, y left, z up), about x: so the probe goes down when
@@ -270,7 +269,7 @@ class SixDofMouseSettings(Settings):
 
 @dataclass(frozen=True)
 class OpenIGTLinkSettings(Settings):
-    """The settings of the connection; each is a key of a scene's ``tracker.openigtlink:``.
+    """The connection to an OpenIGTLink server.
 
     Which of the server's devices is the probe is the scene's ``tracker.body``.
     """
@@ -281,8 +280,8 @@ class OpenIGTLinkSettings(Settings):
     host: str = setting(description="name or address of the server", default="localhost")
     port: int = setting(Quantity("number", 1, 65535), "TCP port", default=18944)
     world: str = setting(
-        description="what the poses are in: the tracker's own frame, or an image's LPS or RAS; "
-        "RAS, which 3D Slicer sends, is turned into LPS, in which volumes are read",
+        description="frame of the poses: the tracker's own, or an image's LPS or RAS; 3D Slicer "
+        "sends RAS, which becomes the volumes' LPS",
         choices=("tracker", "lps", "ras"),
         default="tracker",
     )

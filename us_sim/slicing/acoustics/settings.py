@@ -142,7 +142,7 @@ class SoundSettings(Settings):
     )
     compensation: float = setting(
         Quantity("attenuation", 0.0, 10.0),
-        "of the nominal tissue that the time gain makes up for",
+        "of a nominal tissue, which the time gain compensates",
         default=0.54,
     )
     attenuation: bool = setting(
@@ -186,5 +186,5 @@ class Acoustics(SoundSettings):
     """Artefacts of sound along the current beams, and the acoustic constants of each tissue."""
 
     tissues: Mapping[str, TissueAcoustics] = setting(
-        description="constants by label; of what is not said, the textbook's", default_factory=dict
+        description="constants by label; else the textbook's", default_factory=dict
     )

@@ -21,9 +21,7 @@ from us_sim.slicing.probe.plane import SlicePlane, require_pixel_counts
 
 
 def _depth() -> Any:
-    return setting(
-        Quantity("length", 5e-3, 0.4), "of the image along the beams from the face", live=True
-    )
+    return setting(Quantity("length", 5e-3, 0.4), "of the image along the beams", live=True)
 
 
 def _lines(default: int) -> Any:
@@ -47,7 +45,7 @@ def _focus() -> Any:
 def _frequencies(low: float, high: float) -> Any:
     return setting(
         Quantity("frequency", 0.5e6, 50e6),
-        "lowest and highest that the pulse's middle can have",
+        "lowest and highest of the pulse's middle",
         default=(low, high),
         kw_only=True,
     )

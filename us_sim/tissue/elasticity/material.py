@@ -66,7 +66,7 @@ class Material(Settings):
     poisson_ratio: float = setting(POISSON_RATIO, "Poisson's ratio", default=0.45)
     density: float = setting(DENSITY, "mass per volume", default=1000.0)
     lumen_pressure: float | None = setting(
-        LUMEN_PRESSURE, "of a vessel's blood, which leaves if pressed by more", default=None
+        LUMEN_PRESSURE, "of a vessel's blood, which leaves under more", default=None
     )
 
 

@@ -47,13 +47,13 @@ class MeshSettings(Settings):
     )
     nodes: tuple[int, int, int] | int = setting(
         Quantity("number", 2, 200_000),
-        "of the box along x, y, z; or how many it has at most, which are put close together under "
-        "the probe and where structures are thin",
+        "of the box along x, y, z; or one number, the most it has, closer together under the probe "
+        "and where structures are thin",
         default=(20, 10, 10),
     )
     planes: dict[str, tuple[float, ...]] = setting(
         PLACE,
-        "coordinates of the box's nodes along x, y or z one by one, to put them where they count",
+        "coordinates of the box's nodes along x, y or z, one by one",
         default_factory=dict,
     )
     file: str | None = setting(
@@ -67,8 +67,8 @@ class MeshSettings(Settings):
     pose: Placement = setting(description="of the file's frame in `patient`", default=Placement())
     margin: float | None = setting(
         Quantity("length", 1e-6, 1.0),
-        "how near to a face of the file's bounding box a boundary node belongs to that face; not "
-        "given: a twentieth of the size along that axis",
+        "distance from a face of the file's bounding box within which boundary nodes belong to it; "
+        "not given: a twentieth of the size along that axis",
         default=None,
     )
 

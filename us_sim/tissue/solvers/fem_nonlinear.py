@@ -59,15 +59,15 @@ class FemNonlinearSettings(SolverSettings):
 
     frame_tolerance: float = setting(
         TOLERANCE,
-        "residual, unbalanced over contact forces, and estimated error of the displacement over "
-        "its norm, at which a frame with a moving probe ends",
+        "residual (unbalanced over contact forces) and relative error of the displacement "
+        "(estimated) at which a frame with a moving probe ends",
         default=0.003,
     )
     frame_budget: float | None = setting(
         Quantity("time", 0.0005, 10.0),
-        "time after which a frame ends with what it has, and the next goes on. Not given, 0 as a "
-        "parameter: live, what the rate leaves, and up to a quarter more until residual and error "
-        "are at most 0.01; in lockstep no limit, lest results depend on the machine",
+        "time after which a frame ends, and the next goes on from there. Not given (0 as a "
+        "parameter): live, the time that the rate leaves, and up to a quarter more until residual "
+        "and error are at most 0.01; in lockstep none, so all machines give the same",
         default=None,
     )
     most_iterations: int = setting(

@@ -76,8 +76,8 @@ class MsdsSettings(SolverSettings):
     stabilisation: str = setting(
         choices=("mass_scaling", "substeps", "none"),
         default="mass_scaling",
-        description="what makes a step beyond the limit stable; with none it ends in frames of "
-        "which only the last good state is kept",
+        description="what makes a step beyond the limit stable; with none, only the last good "
+        "state is kept of such frames",
     )
     maximum_substeps: int = setting(COUNT, "of one step; more are refused", default=100)
 
