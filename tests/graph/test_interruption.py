@@ -1,6 +1,7 @@
 """Ctrl-C at any moment: every process ends by itself, and the recording can be read."""
 
 import contextlib
+import os
 import signal
 import subprocess
 import sys
@@ -51,6 +52,16 @@ def test_ctrl_c(played_scene, tmp_path, images):
     assert b"Traceback" not in demo.stderr.read()
     assert message_count(recording, IMAGES) >= images
     assert not recording.exists() or not read_bag(recording).fault  # no node was killed
+
+
+@pytest.mark.parametrize("seconds", [0.7, 1.2, 1.7, 2.2, 2.7])
+def test_ctrl_c_of_a_terminal_while_nodes_are_started(tmp_path, seconds):
+    command = [sys.executable, "-m", "us_sim", "run", "upper_arm"]
+    run = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, start_new_session=True)
+    time.sleep(seconds)
+    os.killpg(run.pid, signal.SIGINT)
+    said = run.communicate(timeout=10)[1]
+    assert (run.returncode, b"Traceback" in said) == (130, False), said.decode()
 
 
 def test_more_than_one_ctrl_c_does_not_break_off_the_end(tmp_path):

@@ -249,6 +249,16 @@ def test_an_examination_tells_no_metrics_and_draws_no_picture_before_its_end(
     assert ask(bench, "draw")
 
 
+@pytest.mark.usefixtures("examination")
+def test_an_examination_that_is_abandoned_is_kept_without_a_picture(bench, tmp_path):
+    scores = bench.collect(DiagnosticArray, "score", latched=True)
+    press(bench, 5.0)
+    bench.spin_until(lambda: bool(scores) and told(scores[-1], "plain")["Highest force, N"] == "5")
+    assert ask(bench, "clear")
+    [page] = (tmp_path / "class").glob("*.html")
+    assert "<img" not in page.read_text()
+
+
 def told(score, kind):
     return {each.key: each.value for each in statuses(score, kind)[0].values}
 

@@ -50,9 +50,10 @@ class Monitor:
         self.reports, self.messages, self.recordings = {}, {}, {}
         self.heard = Counter()
         self.report_losses = self.told.append
+        self.dropped = 0
 
-    def count_messages(self, *_):
-        return 7
+    def count_messages(self, _, topic):
+        return self.dropped if topic == "dropped" else 7
 
     def follow_nodes(self, _):
         pass
@@ -223,9 +224,11 @@ def test_a_recorder_goes_on_in_a_further_file_and_all_of_its_own_are_told(sessio
     again = STARTED[3].parameters
     assert (again["file"], again["if_exists"]) == (str(tmp_path / "session.mcap"), "further")
     monitor.recordings |= {"session.mcap": 1, "session_1.mcap": 4, "of_a_stranger.mcap": 77}
+    monitor.dropped = 3
     outcome = supervisor.make_outcome()
     assert [file.name for file in outcome.files] == ["session.mcap", "session_1.mcap"]
     assert "0 images were recorded of 7" in outcome.describe_losses()
+    assert "3 messages did not reach" in outcome.describe_losses()
     assert outcome.describe_losses().endswith("the recording is in session.mcap, session_1.mcap")
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from us_sim.errors import ScoreError
-from us_sim.scoring.metrics import Force, Scan, VesselSection, compute_metrics
+from us_sim.scoring.metrics import Force, Scan, Tally, VesselSection, compute_metrics
 from us_sim.scoring.motion import Motion
 from us_sim.scoring.settings import ScoreSettings
 
@@ -37,6 +37,11 @@ def test_a_round_of_a_circle():
     assert found.keys() == {(name, "Probe") for name in expected}
     for name, value in expected.items():
         assert found[name, "Probe"] == pytest.approx(value, rel=2e-3), name
+
+
+def test_a_probe_that_never_moved_has_no_speed():
+    piece = Scan(circle(), since=circle().times[-1])  # nothing is new in it
+    assert {metric.value for metric in Tally().add_scan(piece).list_metrics()} == {0.0}
 
 
 def test_a_press_of_a_triangle():

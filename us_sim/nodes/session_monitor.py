@@ -12,7 +12,6 @@ from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.qos import EVERY
 from us_sim.nodes.settings import RECORDER
 
-DROPPED = "dropped"  # in place of a topic: messages that a node lost
 TOLD = 50  # losses that a report lists, the newest
 
 
@@ -46,7 +45,7 @@ class SessionMonitor(GuardedNode):
             self._published[process] = {
                 key.removeprefix("published "): _number(value)
                 for key, value in report.items()
-                if key.startswith("published ") or key == DROPPED
+                if key.startswith("published ") or key == "dropped"
             }
 
     def follow_nodes(self, nodes: Collection[str]) -> None:
@@ -64,7 +63,7 @@ class SessionMonitor(GuardedNode):
         self.health.publish_report()
 
     def count_messages(self, node: str, topic: str) -> int:
-        """Count what ``node`` published on ``topic``, or `DROPPED`, also by earlier processes."""
+        """Count what a node published on ``topic``, or "dropped", also by earlier processes."""
         return sum(
             counts.get(topic, 0) for (name, _), counts in self._published.items() if name == node
         )

@@ -1,7 +1,4 @@
-"""The ROS domain that `us-sim` runs on: its arguments, its context, and one simulation on it.
-
-The arguments after ``--ros-args`` of the command line are for all nodes that it starts.
-"""
+"""The ROS domain that `us-sim` runs on: its arguments, its context, and one simulation on it."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ _taken: list[str] = []
 
 
 def take_ros_arguments(args: Sequence[str]) -> list[str]:
-    """Keep those among the arguments of a command; return the others.
+    """Keep a command's arguments after ``--ros-args``, for all nodes; return the others.
 
     Raises:
         UsSimError: they would give all nodes the same name.

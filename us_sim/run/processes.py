@@ -17,6 +17,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.forkserver import ensure_running
 from typing import TYPE_CHECKING, Any
@@ -51,6 +52,7 @@ def _without_interrupts() -> Iterator[None]:
 def begin_fork_server() -> None:
     """Have the server import what nodes share while this process does something else."""
     if _forking is not _spawning:
+        resource_tracker.ensure_running()  # which lets Ctrl-C through when it has been started
         with _without_interrupts():
             ensure_running()
 

@@ -273,7 +273,7 @@ class Supervisor:
             made, recorded = node.count_messages(IMAGER, IMAGES), count_images(files, self._images)
             if recorded < made:
                 losses.insert(0, f"{recorded} images were recorded of {made} that were made")
-        if files and (lost := node.count_messages(RECORDER, DROPPED)):
+        if files and (lost := node.count_messages(RECORDER, "dropped")):
             losses.insert(0, f"{format_count(lost, 'message')} did not reach the recorder")
         if awaited := node.reports.get(self.plan.player, {}).get("awaited", ""):
             losses.insert(0, f"nothing was played: it waited for {awaited}")

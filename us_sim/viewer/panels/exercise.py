@@ -150,7 +150,8 @@ class ExercisePanel:
         dots = max((len(step.get("target", ())) for step in steps), default=0)
         self._hints.props.update(state=score.get("state", ""), dots=dots)
         self._hints.set_visibility(bool(steps) and not self._only_watches)
-        changed = score.get("about", {}).get("changed", "")
+        about = score.get("about", {})
+        changed = about.get("changed", "")
         self._changed.set_text(f"Changed, and told in the result: {_name_changed(changed)}")
         self._changed.set_visibility(bool(changed))
         count = "" if is_blind(score) else f": {sum(done)} of {len(done)} done"
