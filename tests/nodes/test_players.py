@@ -381,6 +381,16 @@ def test_the_clock_is_that_of_the_recording(bench, numbers):
     bench.spin_until(lambda: sent()[-1:] == [9])
 
 
+def test_between_the_poses_of_a_slow_path_the_last_is_repeated(bench, tmp_path):
+    poses = bench.collect(PoseStamped, "tracker/pose")
+    sparse = written(tmp_path / "sparse.mcap", 10 * STEP)
+    bench.make(PathPlayer, path=str(sparse), rate=0.1)
+    bench.spin_until(lambda: 1 in depths(poses))
+    assert depths(poses)[-1] == 1
+    assert depths(poses).count(0) >= 4  # in a second; the image freezes after half of one
+    assert (np.diff([nanoseconds(pose) for pose in poses]) > 0).all()
+
+
 def test_in_lockstep_the_clock_goes_with_the_poses(bench, path):
     poses = bench.collect(PoseStamped, "tracker/pose")
     ticks = bench.collect(Clock, "/clock")

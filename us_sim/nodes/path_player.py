@@ -69,8 +69,8 @@ class PathPlayer(RecordingPlayer):
 
     @property
     def _tick_s(self) -> float:
-        """Time from pose to pose as they are played, s."""
-        return float(max(1e-9 * self._step / self.settings.rate, 1e-4))
+        """Time from pose to pose as they are played, s, or less, since a held one is repeated."""
+        return float(min(max(1e-9 * self._step / self.settings.rate, 1e-4), 1.0 / HELD))
 
     def _begin(self) -> None:
         """Begin once everything awaited has been there for a while."""
@@ -147,12 +147,17 @@ class PathPlayer(RecordingPlayer):
         while not self._is_over and self._ages[self._next] <= due:
             self._send(self._next)
             self._next += 1
+        if self.settings.rate < 1.0 and self._next and not self._is_over:
+            self._hold(self._next - 1)
         return self._is_over
 
     def hold_still(self) -> None:
         """Send the pose of a held probe a few times a second, unless the player has the clock."""
-        if not self.settings.clock and time.monotonic() - self._sent_at > 1.0 / HELD:
-            self._send(min(self._next, self.pose_count - 1))
+        self._hold(min(self._next, self.pose_count - 1))
+
+    def _hold(self, i: int) -> None:
+        if not self.settings.clock and time.monotonic() - self._sent_at > 0.9 / HELD:
+            self._send(i)
 
     @property
     def _is_over(self) -> bool:
