@@ -86,7 +86,7 @@ def test_meshio_and_the_scenes_reader_find_the_same_surface_in_millimetres(tmp_p
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_structures_of_the_arm_keep_their_volume_within_the_triangles_allowed():
     arm = load_or_make_phantom("upper_arm", seed=1, voxel_size=0.6e-3)
     labels = [n for n, name in arm.label_names.items() if name in ("vein", "artery", "bone")]
