@@ -133,6 +133,7 @@ def test_what_does_not_fit_is_refused(read, message, error, fact):
     "sizes",
     [
         {"offset": 2**32 - 4},
+        {"offset": 2**31 - 2},
         {"point_step": 0},
         {"point_step": 11},
         {"point_step": 2**32 - 1},

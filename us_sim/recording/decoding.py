@@ -196,6 +196,8 @@ def vectors_from(message: Any, frame: str | None = None) -> NDArray[np.float64]:
             "offsets": [fields[name].offset for name in "xyz"],
             "itemsize": message.point_step,
         }
+        if max(layout["offsets"]) >= message.point_step:  # NumPy's own check can overflow
+            raise ValueError("a field is outside of its point")
         points = np.ndarray(count, np.dtype(layout), message.data)
     except KeyError as error:
         raise MeshError(f"the point cloud has no float field for {error} of x, y and z") from None
