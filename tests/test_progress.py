@@ -54,6 +54,11 @@ def test_a_sentence_begins_on_a_line_of_its_own_below_a_bar_that_was_broken_off(
     assert drawn.endswith("\nus-sim: there is no such thing\n")
 
 
+def test_a_bar_has_no_semaphore_that_a_killed_process_would_leave_behind():
+    progress.Progress("solving", 1).close()
+    assert not hasattr(progress.Progress.get_lock(), "mp_lock")
+
+
 def test_the_surface_s_compliance_tells_how_far_it_is(monkeypatch, tmp_path):
     monkeypatch.setenv("US_SIM_CACHE", str(tmp_path))
     monkeypatch.setattr(compliance, "_KEPT", 0)

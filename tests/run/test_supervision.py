@@ -228,7 +228,7 @@ def test_a_recorder_goes_on_in_a_further_file_and_all_of_its_own_are_told(sessio
     outcome = supervisor.make_outcome()
     assert [file.name for file in outcome.files] == ["session.mcap", "session_1.mcap"]
     assert "0 images were recorded of 7" in outcome.describe_losses()
-    assert "3 messages did not reach" in outcome.describe_losses()
+    assert "3 messages not recorded" in outcome.describe_losses()
     assert outcome.describe_losses().endswith("the recording is in session.mcap, session_1.mcap")
 
 

@@ -156,6 +156,7 @@ class PathPlayer(RecordingPlayer):
         self._hold(min(self._next, self.pose_count - 1))
 
     def _hold(self, i: int) -> None:
+        # 0.9: a tick may be early.
         if not self.settings.clock and time.monotonic() - self._sent_at > 0.9 / HELD:
             self._send(i)
 

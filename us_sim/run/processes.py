@@ -41,7 +41,7 @@ if sys.platform == "linux":  # elsewhere forks are not safe
 
 @contextlib.contextmanager
 def _without_interrupts() -> Iterator[None]:
-    """Have what is started meanwhile hear no Ctrl-C, until it is in a session of its own."""
+    """Block Ctrl-C in processes started within, until each has a session of its own."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -274,7 +274,7 @@ class Supervisor:
             if recorded < made:
                 losses.insert(0, f"{recorded} images were recorded of {made} that were made")
         if files and (lost := node.count_messages(RECORDER, "dropped")):
-            losses.insert(0, f"{format_count(lost, 'message')} did not reach the recorder")
+            losses.insert(0, f"{format_count(lost, 'message')} not recorded")
         if awaited := node.reports.get(self.plan.player, {}).get("awaited", ""):
             losses.insert(0, f"nothing was played: it waited for {awaited}")
         return Outcome(self._startup or 0.0, files, losses)
