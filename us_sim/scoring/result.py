@@ -4,7 +4,7 @@ The document has `name`, `description`, `scene`, `state` (of `STATES`), `seconds
 
 - `about`: student, begin, exercise, scene and settings, texts by word,
 - `plain`: the five metrics that are read first, texts by label,
-- `steps` (`what`, `state`, `seen`, `target`, `pose`) and `faults` (`seconds`, `what`),
+- `steps` (`what`, `state`, `seen`, `target`) and `faults` (`seconds`, `what`),
 - `metrics`: all others, texts by label.
 """
 
