@@ -170,3 +170,4 @@ def test_the_residual_is_unbalanced_over_contact_force_or_the_largest_since_rest
     assert released == pytest.approx(np.linalg.norm(elastic) / 40 / 4.0)
     residual.reset()
     assert residual.compute_residual(elastic / 40, np.array([], int), down[:0]) == 1.0
+    assert residual.compute_residual(elastic / 80, np.array([], int), down[:0]) == 1.0  # not 1/2

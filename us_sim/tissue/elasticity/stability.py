@@ -201,8 +201,8 @@ class ElasticResidual:
     """Residual of each frame of a run.
 
     It is the norm of the unbalanced elastic forces over the norm of the contact forces, or, without
-    contact, over the largest such norm since rest. Inertia and damping do not count: it follows
-    from the nodes alone and says how far the tissue is from where it would come to rest.
+    contact, over the largest such norm since rest; it is 1 before the first. Inertia and damping do
+    not count: it says how far the tissue is from where it would come to rest.
 
     Args:
         rounding: N, norm of the forces at rest that arise when coordinates are rounded.
@@ -243,5 +243,5 @@ class ElasticResidual:
         if load == 0.0 and unbalanced_norm <= self._rounding:
             self.largest_load = 0.0
             return 0.0
-        self.largest_load = max(self.largest_load, load) or unbalanced_norm
-        return unbalanced_norm / (load or self.largest_load)
+        self.largest_load = max(self.largest_load, load)
+        return unbalanced_norm / (load or self.largest_load or unbalanced_norm)

@@ -64,7 +64,6 @@ class Fem(TissueSolver):
     )
     must_be_held: ClassVar[bool] = True
     bears_load: ClassVar[bool] = True
-    farthest: ClassVar[float] = 3.0  # fixed nodes hold it
 
     Settings = FemSettings
 

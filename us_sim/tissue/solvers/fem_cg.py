@@ -83,7 +83,6 @@ class FemCg(TissueSolver):
         "linear elasticity as in the paper, nearly solved in each frame: for comparison"
     )
     must_be_held: ClassVar[bool] = True
-    farthest: ClassVar[float] = 3.0  # fixed nodes hold it
     most_unbalanced: ClassVar[float] = 0.3  # within 11 % in 95 of 100 frames
 
     Settings = FemCgSettings

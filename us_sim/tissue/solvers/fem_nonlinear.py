@@ -103,7 +103,6 @@ class FemNonlinear(TissueSolver):
     )
     must_be_held: ClassVar[bool] = True
     bears_load: ClassVar[bool] = True
-    farthest: ClassVar[float] = 3.0  # fixed nodes hold it
     # Of the residual and of the estimated error. Of 102 generated presses of 2,000 nodes by four
     # probes, the first Newton step that came so far was within 7 % of the balance that followed in
     # 72 and within 35 % in 98: neither number knows of tissue that is about to snap.

@@ -39,6 +39,9 @@ TOLERANCE = Quantity("number", 1e-15, 1.0)
 
 _FAILURES = 5
 """Frames in a row that may fail before the tissue is put to rest."""
+_FARTHEST, _FARTHEST_FREE = 3.0, 10.0
+"""A node that moved by this many times the mesh's longest side has left the tissue; the latter
+where no node is fixed."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +83,6 @@ class TissueSolver(ABC):
     """True if every part of the mesh needs fixed nodes that hold it (`require_held`)."""
     bears_load: ClassVar[bool] = False
     """True if gravity and forces at nodes are among its equations."""
-    farthest: ClassVar[float] = 10.0
-    """A node that moved by this many times the mesh's longest side has left the tissue."""
     most_unbalanced: ClassVar[float] = math.inf
     """Residual beyond which the contact forces are no longer those of the pose. Infinite where
     inertia holds the rest, as in a dynamic method."""
@@ -103,7 +104,8 @@ class TissueSolver(ABC):
         self._pose: Pose | None = None
         self._settled = True
         self._failures = 0  # frames in a row that failed
-        self._reach = self.farthest * float(np.ptp(model.mesh.nodes, axis=0).max())
+        farthest = _FARTHEST if model.fixed.any() else _FARTHEST_FREE
+        self._reach = farthest * float(np.ptp(model.mesh.nodes, axis=0).max())
         self._last = self._resting()
 
     def deform(self, probe_pose: Pose | None) -> Deformation:
