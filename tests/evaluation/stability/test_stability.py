@@ -11,6 +11,7 @@ from us_sim.evaluation.stability.cases import (
     SMALL,
     StabilityCase,
     make_model,
+    sample_cases,
     sample_held_cases,
 )
 from us_sim.evaluation.stability.measure import (
@@ -164,6 +165,18 @@ def test_tissue_whose_forces_are_in_balance_before_its_nodes_comes_to_balance():
     # Its residual falls below the frame's tolerance while the displacement's error is above.
     trial = try_case("fem_nonlinear", sample_held_cases(40, seed=7)[23])
     assert trial.held[-1] <= 1e-5
+
+
+@pytest.mark.parametrize(
+    "number",
+    [
+        309,  # swings against its load
+        767,  # flies 9 times its size away
+        863,  # swings against its load, and stays inside out
+    ],
+)
+def test_springs_with_masses_a_million_times_too_large_stay_bounded_and_say_how_unbalanced(number):
+    assert not try_case("msds", sample_cases(1024)[number]).fault
 
 
 @pytest.mark.usefixtures("judged")
