@@ -7,7 +7,7 @@ from PIL import Image
 
 from us_sim.errors import UsSimError
 from us_sim.evaluation import subject as engine
-from us_sim.evaluation.figures import draw_error_over_time, draw_image_grid
+from us_sim.evaluation.figures import draw_image_grid, draw_lines
 from us_sim.evaluation.subject import Piece, Report, Subject, Target
 
 PAGE = "Of $count points.\n\n$error\n\n## Table\n\n$table\n\n## Nothing\n\n$nothing\n"
@@ -34,7 +34,7 @@ def report(table):
         ["`fem` is fast."],
         {
             "count": str(len(table)),
-            "error": draw_error_over_time(table, "ms", "nodes", "Errors", lines="method"),
+            "error": draw_lines(table, "ms", "nodes", "Errors", lines="method", log="xy"),
             "table": table[["method", "ms"]],
             "nothing": "",
         },
@@ -87,8 +87,12 @@ def test_figures_show_every_point_and_image():
         [(scene, method, n, n * 0.1) for scene in "ab" for method in "xy" for n in (1, 2, 3)],
         columns=["scene", "method", "ms", "error"],
     )
-    figure = draw_error_over_time(
-        table, "ms", "error", "", panels="scene", lines="method", limits={"a limit": 2.0}
+    figure = draw_lines(
+        *(table, "ms", "error", ""),
+        panels="scene",
+        lines="method",
+        log="xy",
+        limits={"a limit": 2.0},
     )
     assert [panel.get_title(loc="left") for panel in figure.axes] == ["a", "b"]
     marked = [line for line in figure.axes[0].lines if line.get_marker() != "None"]

@@ -1,13 +1,12 @@
-"""The three kinds of figure of the reports, each over a pandas DataFrame.
+"""The two kinds of figure of the reports, each over a pandas DataFrame.
 
-`draw_error_over_time` and `draw_error_over_parameter` draw a panel for each value of one column,
-and in it a line for each value of another, through the rows' points in the order of x.
-`draw_image_grid` has a row and a column for each name.
+`draw_lines` draws a panel for each value of one column, and in it a line for each value of another,
+through the rows' points in the order of x. `draw_image_grid` has a row and a column for each name.
 
 >>> import pandas as pd
->>> from us_sim.evaluation.figures import draw_error_over_time
+>>> from us_sim.evaluation.figures import draw_lines
 >>> table = pd.DataFrame({"method": ["fem", "msds"], "ms": [1.0, 10.0], "error": [0.1, 0.5]})
->>> draw_error_over_time(table, "ms", "error", "By method", lines="method").get_label()
+>>> draw_lines(table, "ms", "error", "By method", lines="method", log="xy").get_label()
 'By method'
 """
 
@@ -58,20 +57,6 @@ class PlotOptions:
     """Dotted lines across x by their words in the key; with ``y:`` before, across y."""
     floor: float = -math.inf  # smaller y are drawn there
     share_y: bool = True  # one axis y for all panels
-
-
-def draw_error_over_time(
-    table: pd.DataFrame, time: str, error: str, title: str, **options: Any
-) -> Figure:
-    """Draw an error over a run time, both logarithmic, with `PlotOptions` by name."""
-    return draw_lines(table, time, error, title, **{"log": "xy", **options})
-
-
-def draw_error_over_parameter(
-    table: pd.DataFrame, parameter: str, error: str, title: str, **options: Any
-) -> Figure:
-    """Draw an error, logarithmic, over a parameter, with `PlotOptions` by name."""
-    return draw_lines(table, parameter, error, title, **{"log": "y", **options})
 
 
 def draw_lines(table: pd.DataFrame, x: str, y: str, title: str, **keywords: Any) -> Figure:

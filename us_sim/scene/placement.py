@@ -98,10 +98,9 @@ class RestPlacement:
         corners_of = tetrahedra.reshape(-1, 4).astype(np.int32)
         deformed = TetrahedralMesh(self._nodes[kept], corners_of)
         where = locate_points(deformed, points)
-        corners = mesh.nodes[mesh.tetrahedra[upright[where.tetrahedra]]]
-        rest = np.einsum("pa,pax->px", where.weights, corners)
+        rest = where.interpolate(mesh.nodes[mesh.tetrahedra[upright]])
         rest[where.outside > 0.0] = np.nan
-        return np.asarray(rest, dtype=np.float64)
+        return rest
 
     def _deform(self, pose: Pose) -> NDArray[np.float64]:
         """Deform the tissue until it is at rest under a held probe; return its nodes (N, 3) m."""

@@ -113,8 +113,8 @@ def test_barycentric_coordinates_give_the_point_back(seed):
     points = random.uniform([-0.15, -0.1, -0.05], [0.15, 0.1, 0.15], (200, 3))
     where = locate_points(mesh, points)
     np.testing.assert_allclose(where.weights.sum(axis=1), 1.0, atol=1e-12)
-    corners = mesh.nodes[mesh.tetrahedra[where.tetrahedra]]
-    np.testing.assert_allclose(np.einsum("pa,pax->px", where.weights, corners), points, atol=1e-12)
+    found = where.interpolate(mesh.nodes[mesh.tetrahedra])
+    np.testing.assert_allclose(found, points, atol=1e-12)
     beyond = np.maximum([-0.1, -0.05, 0.0] - points, points - [0.1, 0.05, 0.1]).clip(0.0)
     np.testing.assert_allclose(where.outside, np.linalg.norm(beyond, axis=1), atol=1e-12)
     assert (where.weights[where.outside == 0.0] >= -1e-9).all()

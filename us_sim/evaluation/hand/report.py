@@ -7,7 +7,7 @@ from functools import partial
 
 import pandas as pd
 
-from us_sim.evaluation.figures import draw_error_over_time
+from us_sim.evaluation.figures import draw_lines
 from us_sim.evaluation.hand.hand_motion import KINDS, RATE
 from us_sim.evaluation.hand.measure import list_motions, measure_motion
 from us_sim.evaluation.settings import HandSettings
@@ -88,7 +88,7 @@ def _report(table: pd.DataFrame) -> Report:
     ]
     places = {
         "judged": JUDGED,
-        "error": draw_error_over_time(
+        "error": draw_lines(
             pd.concat(points),
             "ms",
             "mm",
@@ -96,6 +96,7 @@ def _report(table: pd.DataFrame) -> Report:
             panels="motion",
             lines="method",
             filled="median",
+            log="xy",
             floor=1e-3,
             limits={"16.7 ms: 60 Hz": 1e3 / RATE},
             labels={"ms": "processor time of a frame, ms", "mm": "error of the worst node, mm"},

@@ -29,7 +29,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import KDTree
 
 from us_sim.errors import SolverError, UsSimError
-from us_sim.evaluation.figures import draw_error_over_parameter
+from us_sim.evaluation.figures import draw_lines
 from us_sim.evaluation.subject import Piece, Place
 from us_sim.geometry.collider import Sphere
 from us_sim.tissue.elasticity.linear_tetrahedra import assemble_lame_stiffness
@@ -168,9 +168,7 @@ class PrescribedBox:
 
     def interpolate_field(self, field: Array, points: Array) -> Array:
         """Interpolate a nodal field (N, 3) m at points (P, 3) m: (P, 3) m."""
-        place = locate_points(self.mesh, points)
-        corners = field[self.mesh.tetrahedra[place.tetrahedra]]
-        return np.asarray(np.einsum("pa,pad->pd", place.weights, corners))
+        return locate_points(self.mesh, points).interpolate(field[self.mesh.tetrahedra])
 
 
 def _compute_rms(vectors: Array) -> float:
@@ -229,10 +227,9 @@ def report_hydrogel(rows: pd.DataFrame) -> tuple[str, dict[str, Place]]:
     """Report the errors of the beads, in all and by height."""
     whole, layers = rows[rows["case"] == "all"], rows[rows["case"] != "all"]
     floor = layers.assign(error=layers["floor"], line="noise").drop_duplicates("x")
-    figure = draw_error_over_parameter(
+    figure = draw_lines(
         *(pd.concat([layers, floor]), "x", "error", "Beads in a gel: error by height"),
         lines="line",
-        log="",
         labels={"x": "height above the glass, µm", "error": "root mean square error, µm"},
     )
     plain, best = (row for row in whole.iloc[1:].to_dict("records"))

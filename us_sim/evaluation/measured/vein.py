@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from us_sim.evaluation.figures import draw_error_over_parameter
+from us_sim.evaluation.figures import draw_lines
 from us_sim.evaluation.subject import Piece, Place
 from us_sim.geometry.pose import Pose
 from us_sim.scene.building import build_scanner, build_tissue_model, load_volume
@@ -149,11 +149,10 @@ def report_vein(rows: pd.DataFrame) -> tuple[str, dict[str, Place]]:
             for pressure, area in row.curve
         ]
     )
-    figure = draw_error_over_parameter(
+    figure = draw_lines(
         *(points, "pressure", "area", "The arm's vein under a probe, at calf veins' pressures"),
         panels="panel",
         lines="line",
-        log="",
         labels={"pressure": "mmHg", "area": "area of the vein, %"},
         limits={"y:closed": 100 * _CLOSED},
     )

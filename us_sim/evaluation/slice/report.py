@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from us_sim.evaluation.figures import draw_error_over_time, draw_lines
+from us_sim.evaluation.figures import draw_lines
 from us_sim.evaluation.report import fit_exponent
 from us_sim.evaluation.slice.cases import MAIN, PLANES, list_cases
 from us_sim.evaluation.slice.measure import OURS, measure_case
@@ -71,7 +71,7 @@ def _report(table: pd.DataFrame) -> Report:
         "table": main[["method", "threads", "ms_median", "ms_p99", "cpu_ms_median"]].join(
             worst, on=["method", "threads"]
         ),
-        "error": draw_error_over_time(
+        "error": draw_lines(
             sizes.assign(
                 ms=np.where(sizes["threads"] == 1, sizes["cpu_ms_median"], sizes["ms_median"]),
                 panel=sizes["size"].map("{0} × {0}".format),
@@ -83,6 +83,7 @@ def _report(table: pd.DataFrame) -> Report:
             panels="panel",
             lines="method",
             filled="single",
+            log="xy",
             floor=1e-14,
             limits={"16.7 ms: 60 images a second": 1000.0 / 60.0, "y:a tenth of a voxel": 0.1},
             labels={"ms": "ms an image (median)", "max_voxel_error": "worst pixel, voxels at rest"},

@@ -13,7 +13,7 @@ from unittest.mock import patch
 import pandas as pd
 from threadpoolctl import threadpool_limits
 
-from us_sim.evaluation.figures import draw_error_over_parameter
+from us_sim.evaluation.figures import draw_lines
 from us_sim.evaluation.stability.cases import (
     StabilityCase,
     list_extreme_cases,
@@ -106,7 +106,7 @@ def report_stability(rows: pd.DataFrame) -> Report:
     labels = {"contrast": "contrast within the mesh", "softness": "0.5 - Poisson's ratio"}
     labels |= {"residual_checked": "residual under the probe", "recovered_mm": "mm from rest"}
     figures = {
-        name: draw_error_over_parameter(
+        name: draw_lines(
             *(ran, x, y, title),
             panels="method",
             lines="method",

@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from us_sim.evaluation.block import MESHES
-from us_sim.evaluation.figures import draw_error_over_time
+from us_sim.evaluation.figures import draw_lines
 from us_sim.evaluation.subject import Report, Subject
 from us_sim.evaluation.tissue.cases import MAIN_SCENE, SCENES
 from us_sim.evaluation.tissue.measure import plan_pieces
@@ -68,13 +68,14 @@ def _draw_errors(points: pd.DataFrame, panels: str, words: str) -> Figure:
         line: replace(LOOKS[method], style="-" if line == method else "--")
         for method, line in zip(points["method"], points["line"], strict=True)
     }
-    return draw_error_over_time(
+    return draw_lines(
         *(points, "ms_median", "rel_l2_error", f"Error against run time, {words}"),
         panels=panels,
         lines="line",
         looks=looks,
         labels=_LABELS,
         filled="default",
+        log="xy",
         limits=_AT_FRAME_RATE,
     )
 

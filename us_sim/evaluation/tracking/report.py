@@ -10,11 +10,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from us_sim.evaluation.figures import (
-    draw_error_over_parameter,
-    draw_error_over_time,
-    draw_image_grid,
-)
+from us_sim.evaluation.figures import draw_image_grid, draw_lines
 from us_sim.evaluation.subject import Piece, Report, Subject, Target
 from us_sim.evaluation.tracking.cases import (
     CONDITIONS,
@@ -101,7 +97,7 @@ def _report(table: pd.DataFrame) -> Report:
             "angle_deg",
             "Median error over the angle, at 0.4 m, 640 × 480",
         ),
-        "run_time": draw_error_over_time(
+        "run_time": draw_lines(
             _melt_errors(plain[plain["distance_m"] == 0.4]),
             "cpu_ms_median",
             "error",
@@ -109,6 +105,7 @@ def _report(table: pd.DataFrame) -> Report:
             panels="of",
             lines="marker",
             filled="small",
+            log="xy",
             join=False,
             share_y=False,
             labels={"cpu_ms_median": "processor time of an image, ms (median)", "error": ""},
@@ -145,7 +142,7 @@ def _melt_errors(table: pd.DataFrame) -> pd.DataFrame:
 def _draw_errors(table: pd.DataFrame, parameter: str, title: str) -> Figure:
     labels = {"distance_m": "distance, m", "angle_deg": "angle, degrees", "error": ""}
     look: Any = {"panels": "of", "lines": "marker", "share_y": False, "labels": labels}
-    return draw_error_over_parameter(_melt_errors(table), parameter, "error", title, **look)
+    return draw_lines(_melt_errors(table), parameter, "error", title, log="y", **look)
 
 
 def _draw_views() -> Figure:

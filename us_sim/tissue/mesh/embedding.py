@@ -27,6 +27,10 @@ class MeshLocation:
     weights: NDArray[np.float64]  # (P, 4), barycentric, sum 1; some negative outside the mesh
     outside: NDArray[np.float64]  # (P,) m, distance to the mesh, 0 within it
 
+    def interpolate(self, corners: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Interpolate vectors (M, 4, 3) at the corners of tetrahedra; return (P, 3)."""
+        return np.asarray(np.einsum("pa,pax->px", self.weights, corners[self.tetrahedra]))
+
 
 def locate_points(mesh: TetrahedralMesh, points: NDArray[np.float64]) -> MeshLocation:
     """Find each point's tetrahedron, or the one whose face on the boundary is nearest to it.
