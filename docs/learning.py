@@ -22,7 +22,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from us_sim.environment.agents import VisualServo, find_dark_spots
 from us_sim.environment.environment import ScanEnvironment
-from us_sim.progress import Progress
+from us_sim.progress import ProgressBar
 
 FOLDER = Path(__file__).parent
 TRAINING, TESTS, STEPS = 40_000, 24, 150
@@ -101,7 +101,7 @@ def train_policy(environment: ScanEnvironment, seed: int) -> tuple[PPO, Monitor[
     # vein stays pressed, and a policy that always presses has nothing to gain by a step upwards.
     rates = {"gamma": 0.9, "learning_rate": 1e-3}
     model = PPO("MlpPolicy", Senses(arm, ONE_ARM), n_steps=250, batch_size=50, seed=seed, **rates)
-    with Progress(f"training, seed {seed}", TRAINING, "steps") as bar:
+    with ProgressBar(f"training, seed {seed}", TRAINING, "steps") as bar:
 
         def show(now: dict[str, Any], _: Any) -> bool:
             bar.update(HOLD * now["self"].num_timesteps)
@@ -123,7 +123,7 @@ def main() -> None:
 
     def compare(name: str, arms: Any, acts: list[Any]) -> None:
         results = []
-        with Progress(f"testing {name}", TESTS, "episodes") as bar:
+        with ProgressBar(f"testing {name}", TESTS, "episodes") as bar:
             for seed, act in enumerate(acts):  # all agents with the same draws
                 results.append(score(arms, act, seed))
                 bar.update(seed + 1)

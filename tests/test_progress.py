@@ -55,8 +55,8 @@ def test_a_sentence_begins_on_a_line_of_its_own_below_a_bar_that_was_broken_off(
 
 
 def test_a_bar_has_no_semaphore_that_a_killed_process_would_leave_behind():
-    progress.Progress("solving", 1).close()
-    assert not hasattr(progress.Progress.get_lock(), "mp_lock")
+    progress.ProgressBar("solving", 1).close()
+    assert not hasattr(progress.ProgressBar.get_lock(), "mp_lock")
 
 
 def test_the_surface_s_compliance_tells_how_far_it_is(monkeypatch, tmp_path):

@@ -1,19 +1,17 @@
 """A line that shows how far a long run is."""
 
-from __future__ import annotations
-
 import shutil
 import sys
-from collections.abc import Callable
 
 from tqdm.std import TRLock, tqdm  # type: ignore[attr-defined]
 
+from us_sim import Progress
 from us_sim.errors import printable_line
 
 tqdm.set_lock(TRLock())  # its own is a semaphore, which a process that is killed would leave behind
 
 
-class Progress(tqdm):
+class ProgressBar(tqdm):
     """A bar on stderr from 0 to ``total``, drawn once ``delay`` s have passed.
 
     Without a total it is only the text; where stderr is no terminal, a line every few seconds.
@@ -40,13 +38,13 @@ class Progress(tqdm):
         super().update((done if self.total is None else min(done, self.total)) - self.n)
 
 
-def late_progress(description: str) -> Callable[[float, str], None]:
+def late_progress(description: str) -> Progress:
     """Return a function of the fraction done, which ends a bar at 1, and of what is being done."""
-    bar: Progress | None = None
+    bar: ProgressBar | None = None
 
     def show(fraction: float, text: str) -> None:
         nonlocal bar
-        bar = bar or Progress(description, 100, "%", delay=1.0)
+        bar = bar or ProgressBar(description, 100, "%", delay=1.0)
         bar.update(100 * fraction, text)
         if fraction >= 1.0:
             bar.close()

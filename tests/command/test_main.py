@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from us_sim.command.main import main
-from us_sim.progress import Progress
+from us_sim.progress import ProgressBar
 from us_sim.recording.writer import BagWriter
 from us_sim.run.supervision import SupervisionSettings, Supervisor, print_above_bar
 
@@ -105,7 +105,7 @@ def test_without_standard_error_work_goes_on(stream, monkeypatch, tmp_path, caps
 def test_what_strangers_say_moves_no_cursor_and_fills_no_screen(capsys):
     hostile = "\x1b[2J\x1b]0;owned\x07\r\u202e" + "x" * 10_000
     print_above_bar(hostile)
-    with Progress("running", 1, "s") as bar:
+    with ProgressBar("running", 1, "s") as bar:
         bar.update(0.5, hostile)
     Supervisor(SupervisionSettings())._show("scorer", hostile)
     error = capsys.readouterr().err

@@ -192,7 +192,7 @@ def cluster(monkeypatch):
 def test_a_node_that_is_killed_loses_and_doubles_nothing(cluster, scene, tmp_path, monkeypatch):
     node, shown = cluster.add_node(num_cpus=1), []
 
-    class Killing(dataset.Progress):
+    class Killing(dataset.ProgressBar):
         """Kills a node after the first episode, when both have been given others."""
 
         def update(self, done, text=""):
@@ -203,7 +203,7 @@ def test_a_node_that_is_killed_loses_and_doubles_nothing(cluster, scene, tmp_pat
 
     options = "--task", "FindVein", "--episodes", "6"
     with monkeypatch.context() as patched:
-        patched.setattr(dataset, "Progress", Killing)
+        patched.setattr(dataset, "ProgressBar", Killing)
         assert make(scene, tmp_path / "ray", *options, "--ray", cluster.address) == 0
     assert shown == list(range(7))
     assert not cluster.worker_nodes

@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim import Progress
 from us_sim.command.calibration_settings import (
     CameraCalibrationSettings,
     ClockCalibrationSettings,
     LandmarkCalibrationSettings,
     PivotCalibrationSettings,
-    Progress,
 )
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose

@@ -7,16 +7,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from us_sim.errors import CalibrationError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-
-Progress = Callable[[float, str], None]
-"""A callback that takes the fraction done, and words on the work."""
 
 _POSE = (
     "topic of a bag, or transform of Plus such as StylusToReference; may be left out where "

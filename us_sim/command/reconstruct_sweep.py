@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from us_sim import Progress
 from us_sim.command.volume_pictures import draw_slices
 from us_sim.errors import VolumeError
 from us_sim.settings.setting import Settings, setting
@@ -16,7 +17,7 @@ from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.writing import VOLUME_ENDINGS, write_volume
 from us_sim.volume.reconstruction.calibration_file import SweepCalibration, read_calibration
-from us_sim.volume.reconstruction.reconstruction import Progress, Rest, plan_insertion, reconstruct
+from us_sim.volume.reconstruction.reconstruction import Rest, plan_insertion, reconstruct
 from us_sim.volume.reconstruction.scanning_probe import find_scanning_probe
 from us_sim.volume.reconstruction.settings import Compounding, ImagePart
 from us_sim.volume.sequences.sweep import TrackedSweep, read_sweep

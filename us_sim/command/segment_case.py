@@ -8,11 +8,11 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from us_sim import Progress
 from us_sim.errors import CaseError, VolumeError
 from us_sim.settings.spelling import align_columns
 from us_sim.share import shared_roots
@@ -32,8 +32,6 @@ from us_sim.volume.volume import LabelMap, Volume
 
 PICTURE = "segmentation.png"
 _HEADING = ("structure", "volume", "triangles")
-
-Progress = Callable[[float, str], None]
 
 
 def run_segmentation(asked: SegmentRequest, progress: Progress = lambda *_: None) -> str:

@@ -36,7 +36,7 @@ from us_sim.environment.agents import VisualServo, WanderingAgent
 from us_sim.environment.environment import ScanEnvironment, resolve_scene
 from us_sim.environment.tasks import TASKS
 from us_sim.errors import EpisodeError, UsSimError
-from us_sim.progress import Progress
+from us_sim.progress import ProgressBar
 from us_sim.recording.attached_files import list_versions
 from us_sim.scene.scene import Scene
 from us_sim.settings.quantity import Quantity
@@ -134,7 +134,7 @@ def make_dataset(
     for order in {order.scene_name: order for order in missing}.values():
         _load_environment(order)
     try:
-        with Progress("making", len(orders), "episodes") as bar:
+        with ProgressBar("making", len(orders), "episodes") as bar:
             bar.update(len(orders) - len(missing))
             for order, facts in _make_episodes(missing, settings):
                 found[order.name] = facts

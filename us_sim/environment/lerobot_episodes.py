@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from us_sim.environment.tasks import TASKS
 from us_sim.errors import EpisodeError
-from us_sim.progress import Progress
+from us_sim.progress import ProgressBar
 from us_sim.recording.lerobot_writer import (
     IMAGES,
     POSE_PARTS,
@@ -64,7 +64,7 @@ def write_lerobot(
         _require_whole(folder, len(episodes))
         return
     about = inspect.getdoc(TASKS[task]) if task else "Scan the skin."
-    with Progress("writing for LeRobot", len(episodes), "episodes") as bar:
+    with ProgressBar("writing for LeRobot", len(episodes), "episodes") as bar:
 
         def read_episodes() -> Iterator[LeRobotEpisode]:
             for done, (name, facts) in enumerate(sorted(episodes.items()), 1):

@@ -48,7 +48,7 @@ from PIL import Image
 
 from us_sim.errors import UsSimError
 from us_sim.evaluation.report import describe_machine, format_markdown_table
-from us_sim.progress import Progress
+from us_sim.progress import ProgressBar
 
 Place: TypeAlias = "str | Sequence[str] | pd.DataFrame | Figure"
 
@@ -237,7 +237,7 @@ def _measure(
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]], list[str]]:
     """Return the rows of all pieces, a row for each that broke off, and all failures in words."""
     rows, broken, failures = [], [], []
-    with Progress(name, len(pieces), "pieces") as progress:
+    with ProgressBar(name, len(pieces), "pieces") as progress:
         for done, piece in enumerate(pieces):
             progress.update(done, str(piece))
             try:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import RECORDER, VIEWER, PlayerSettings, check_parameters
-from us_sim.progress import Progress
+from us_sim.progress import ProgressBar
 from us_sim.run.domain import get_domain, get_ros_arguments, lock_domain
 from us_sim.run.plan import (
     NodeProcess,
@@ -82,7 +82,7 @@ def follow_plan(
 def _await_all(update: Callable[[], None], supervisor: Supervisor) -> None:
     count = len(supervisor.plan.nodes)
     began = time.monotonic()
-    with Progress("starting", count, "nodes") as bar:
+    with ProgressBar("starting", count, "nodes") as bar:
         while waiting := supervisor.waiting:
             update()
             more = f" and {len(waiting) - 2} more" if len(waiting) > 2 else ""
@@ -94,7 +94,7 @@ def _await_all(update: Callable[[], None], supervisor: Supervisor) -> None:
 def _stay(update: Callable[[], None], supervisor: Supervisor) -> None:
     began, duration = time.monotonic(), supervisor.plan.duration
     ended: float | None = None
-    with Progress("running", duration, "s") as bar:
+    with ProgressBar("running", duration, "s") as bar:
         while True:
             update()
             now = time.monotonic()
@@ -250,7 +250,7 @@ def _report(scene: Scene, out: Path, outcome: Outcome, wall: float) -> None:
     from us_sim.run.contact_sheet import contact_sheet
     from us_sim.run.session_summary import read_session
 
-    with Progress("measuring the recording", 100, "%") as bar:
+    with ProgressBar("measuring the recording", 100, "%") as bar:
         session = read_session(*outcome.files)
         meter = session.measure_lumens(scene, 120, lambda done: bar.update(50 * done))
         sections = meter.collect_comparable_sections() if meter is not None else {}

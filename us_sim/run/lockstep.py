@@ -13,7 +13,7 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from us_sim.errors import UsSimError
-from us_sim.progress import Progress
+from us_sim.progress import ProgressBar
 from us_sim.run.domain import make_ros_context
 from us_sim.run.plan import NodeProcess, RunRequest, make_plan, prepare_scene
 from us_sim.run.processes import prepare_ros
@@ -52,7 +52,7 @@ def render_scene(request: RunRequest, out: Path, *, truth: bool = False) -> int:
         NodeProcess("image_writer", {what: str(folder) for what, folder in written.items()}),
         *(replace(node, parameters={"lockstep": True} | node.parameters) for node in nodes),
     ]
-    with Progress("rendering", plan.poses, "images") as bar:
+    with ProgressBar("rendering", plan.poses, "images") as bar:
         count = _run(processes, bar.update, [*folders])
     print(f"{format_count(count, 'image')} in {out / 'images'}, all messages in {request.record}")
     for what, folder in folders.items():

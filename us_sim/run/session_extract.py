@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 
+from us_sim import Progress
 from us_sim.errors import BagError, TrackingError
 from us_sim.recording.attached_files import new_file
 from us_sim.recording.decoding import affine_from
@@ -21,7 +22,6 @@ from us_sim.run.session_summary import read_session, unpack_scene
 from us_sim.run.session_tables import (
     SECOND,
     WRENCH_STAMPED,
-    Progress,
     list_pose_sources,
     list_topics,
     read_times,

@@ -17,6 +17,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from us_sim import Progress
 from us_sim.errors import BagError, TrackingError
 from us_sim.recording.lerobot_writer import (
     IMAGES,
@@ -31,7 +32,6 @@ from us_sim.recording.reader import Bag, read_bag
 from us_sim.run.session_tables import (
     SECOND,
     VALUES,
-    Progress,
     list_pose_sources,
     list_topics,
     read_times,

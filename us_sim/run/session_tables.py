@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from us_sim import Progress
 from us_sim.errors import BagError
 from us_sim.recording.attached_files import new_file
 from us_sim.recording.lerobot_writer import POSE_PARTS, WRENCH_PARTS
@@ -26,8 +27,6 @@ SECOND = 1_000_000_000  # ns
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
 _LARGEST = 2**63 - 1
 _COLUMNS = ("stamp", "logged", "sent", "number", "size", "is_short")
-Progress = Callable[[float, str], None]
-"""Takes the fraction done, and what is being done."""
 
 
 def read_times(

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim import Progress
 from us_sim.errors import BagError, ProbeError, SceneError, TrackingError, UsSimError
 from us_sim.geometry.pose import Placement, Pose
 from us_sim.scene.scene import Scene, TissueSettings
@@ -53,7 +54,7 @@ if TYPE_CHECKING:
 _TAKEN_BACK = "; of what the base of a scene says, `null` takes back a material (`fat: null`)"
 
 
-def load_volume(scene: Scene, progress: Callable[[float, str], None] | None = None) -> Volume:
+def load_volume(scene: Scene, progress: Progress | None = None) -> Volume:
     """Load the scene's volume in frame ``patient``, from its case, its file or its phantom."""
     if scene.volume.case:
         from us_sim.volume.cases.case import read_case

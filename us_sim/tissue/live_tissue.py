@@ -19,6 +19,7 @@ import numpy as np
 from numba.core import event
 from numpy.typing import NDArray
 
+from us_sim import Progress
 from us_sim.errors import SolverError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SOLVERS
@@ -26,12 +27,7 @@ from us_sim.tissue.elasticity.linear_tetrahedra import require_held
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.model import Deformation, TissueModel
-from us_sim.tissue.solvers.solver import (
-    Progress,
-    SolverSettings,
-    TissueSolver,
-    make_small_model,
-)
+from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver, make_small_model
 
 COMPILING_SWITCH_INTERVAL = 1e-4  # s, see above
 

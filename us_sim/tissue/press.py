@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from us_sim import Progress
 from us_sim.errors import SolverError
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
@@ -38,7 +38,7 @@ def press_to_force(
     step: float = 1e-3,
     deepest: float = 0.1,
     tolerance: float = 1e-3,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> list[Press]:
     """Press a probe along its axis until the tissue pushes back with a force.
 

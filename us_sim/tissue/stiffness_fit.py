@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
+from us_sim import Progress
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
@@ -26,7 +27,6 @@ from us_sim.tissue.contact.probe_gap import measure_gaps
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
-from us_sim.tissue.solvers.solver import Progress
 
 FARTHEST = 100.0
 """Factor by which a modulus may differ from the one that the fit begins with."""

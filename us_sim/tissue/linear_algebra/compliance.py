@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from us_sim import Progress
 from us_sim.cache import load_or_create
 from us_sim.errors import SolverError
 from us_sim.kernels import njit
@@ -183,9 +184,9 @@ class SurfaceCompliance:
 
 def compute_compliance(
     model: TissueModel,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress | None = None,
     *,
-    has_error: bool = True,
+    needs_imbalance: bool = True,
 ) -> SurfaceCompliance:
     """Solve for a unit force along each axis at each node that the probe can touch.
 
@@ -195,7 +196,7 @@ def compute_compliance(
     Args:
         model: of the tissue and the probe.
         progress: called with the fraction done and a label, if it takes a second or more.
-        has_error: whether `SurfaceCompliance.compute_imbalance` is needed, a fifth of the work.
+        needs_imbalance: for `SurfaceCompliance.compute_imbalance`, a fifth of the work.
 
     Raises:
         SolverError: the tissue is not held, its moduli are too different, or the fields do not fit
@@ -210,7 +211,7 @@ def compute_compliance(
             f"coarser mesh, or choose fem_cg or msds"
         )
     if not _KEPT <= 9 * touched * free <= _MOST_KEPT:
-        return _compute(model, progress, has_error)
+        return _compute(model, progress, needs_imbalance)
     return load_or_create(_key(model), _pack, _unpack, lambda: _compute(model, progress))
 
 
@@ -231,8 +232,8 @@ def compute_loaded_displacement(model: TissueModel) -> NDArray[np.float64]:
 
 def _compute(
     model: TissueModel,
-    progress: Callable[[float, str], None] | None,
-    has_error: bool = True,
+    progress: Progress | None,
+    needs_imbalance: bool = True,
 ) -> SurfaceCompliance:
     def show(fraction: float) -> None:
         if progress is not None:
@@ -272,7 +273,7 @@ def _compute(
         matrix /= 2
         none = np.zeros((0, 0), np.float32)
         made = SurfaceCompliance(nodes, matrix, found, len(points), none, math.nan)
-        if not has_error:
+        if not needs_imbalance:
             return made
         if not is_large:
             return replace(made, gram=_gram(made, found, system, model.fixed))

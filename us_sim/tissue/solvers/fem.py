@@ -23,6 +23,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim import Progress
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.compliant_contact import CompliantContact
 from us_sim.tissue.contact.probe_gap import wrench_on_probe
@@ -30,7 +31,7 @@ from us_sim.tissue.contact.stiffness import compliance_between, compute_contact_
 from us_sim.tissue.elasticity.stability import count_inverted, select_watched_tetrahedra
 from us_sim.tissue.linear_algebra.compliance import compute_compliance, compute_loaded_displacement
 from us_sim.tissue.model import Deformation, TissueModel, TissueState
-from us_sim.tissue.solvers.solver import Progress, SolverSettings, TissueSolver
+from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
 
 _EXTENSIONS = 10
 """Times that nodes overlooked at first, being far from the probe, may be added in a frame."""

@@ -23,6 +23,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from us_sim import Progress
 from us_sim.geometry.pose import Pose, is_same_pose
 from us_sim.settings.setting import setting
 from us_sim.tissue.contact.active_set import ActiveSet
@@ -35,13 +36,7 @@ from us_sim.tissue.elasticity.linear_tetrahedra import (
 from us_sim.tissue.elasticity.stability import count_inverted, select_watched_tetrahedra
 from us_sim.tissue.linear_algebra.conjugate_gradients import conjugate_gradients, product_rows
 from us_sim.tissue.model import Deformation, TissueModel, TissueState
-from us_sim.tissue.solvers.solver import (
-    COUNT,
-    TOLERANCE,
-    Progress,
-    SolverSettings,
-    TissueSolver,
-)
+from us_sim.tissue.solvers.solver import COUNT, TOLERANCE, SolverSettings, TissueSolver
 
 _REFINEMENT = 1e-2
 """Fraction to which the residual must fall before touched nodes that slid a little are

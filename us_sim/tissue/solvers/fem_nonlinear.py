@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from us_sim import Progress
 from us_sim.geometry.pose import Pose, is_same_pose
 from us_sim.geometry.se3 import interpolate_poses
 from us_sim.settings.quantity import Quantity
@@ -41,13 +42,7 @@ from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueSt
 from us_sim.tissue.solvers.discretisation_error import estimate_relative_error
 from us_sim.tissue.solvers.frame_budget import FrameBudget
 from us_sim.tissue.solvers.newton import Newton
-from us_sim.tissue.solvers.solver import (
-    COUNT,
-    TOLERANCE,
-    Progress,
-    SolverSettings,
-    TissueSolver,
-)
+from us_sim.tissue.solvers.solver import COUNT, TOLERANCE, SolverSettings, TissueSolver
 from us_sim.tissue.solvers.tuning import TUNING
 
 
@@ -131,7 +126,7 @@ class FemNonlinear(TissueSolver):
         self._budget = FrameBudget()
         self._recovery = InversionRecovery(self._newton.displacement)
         if len(self._surface):
-            self._compliance = compute_compliance(model, progress, has_error=False)
+            self._compliance = compute_compliance(model, progress, needs_imbalance=False)
         self._restore(self.state)
 
     @property

@@ -15,6 +15,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim import Progress
 from us_sim.geometry.collider_distance import rotate_vector, rotate_vector_back
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
@@ -31,7 +32,7 @@ from us_sim.tissue.elasticity.stability import (
     step_limit,
 )
 from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
-from us_sim.tissue.solvers.solver import COUNT, Progress, SolverSettings, TissueSolver
+from us_sim.tissue.solvers.solver import COUNT, SolverSettings, TissueSolver
 
 REST_TIME = 0.2
 """Shortest time for which motion is watched before the tissue counts as settled, s."""

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim import Progress
 from us_sim.errors import SolverError
 from us_sim.geometry.pose import Pose, is_same_pose
 from us_sim.settings.quantity import Quantity
@@ -28,9 +28,6 @@ from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
 from us_sim.tissue.solvers.discretisation_error import estimate_force_error
-
-Progress = Callable[[float, str], None]
-"""Called with the fraction done of what takes long, and what is being made."""
 
 COUNT = Quantity("number", 1, 10_000)
 """Iterations, updates or steps in a frame."""

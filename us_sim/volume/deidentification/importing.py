@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim import Progress
 from us_sim.errors import VolumeError
 from us_sim.volume.deidentification.settings import ImportSettings, PixelRectangle
 from us_sim.volume.files.dicom.header import (
@@ -39,8 +40,6 @@ from us_sim.volume.files.stored_image import read_grey_voxels, stack_slices
 from us_sim.volume.files.writing import VOLUME_ENDINGS, write_volume
 from us_sim.volume.partial_file import partial_file
 from us_sim.volume.volume import Volume
-
-Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from us_sim import Progress
 from us_sim.cache import cache_folder, load_or_create
 from us_sim.errors import VolumeError
 from us_sim.settings.registry import PHANTOMS
 from us_sim.volume.settings import SEED, VOXEL_SIZE
 from us_sim.volume.volume import Volume
-
-Progress = Callable[[float, str], None]
 
 _GENERATOR = 2
 """Part of the cache's key: raise it when a change here, or in what this calls, changes a phantom's

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim import Progress
 from us_sim.errors import VolumeError
 from us_sim.volume.files.stored_image import check_memory
 from us_sim.volume.reconstruction.grid import (
@@ -22,8 +23,6 @@ from us_sim.volume.reconstruction.insertion import compute_means, fill_holes, in
 from us_sim.volume.reconstruction.settings import Compounding, ImagePart
 from us_sim.volume.sequences.sweep import TrackedSweep
 from us_sim.volume.volume import Volume
-
-Progress = Callable[[float, str], None]  # is told the fraction done, and the work in progress
 
 Rest = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
 """Takes the index of a frame and points (N, 3) m of it; where these lie while nothing presses."""

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import SimpleITK
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from us_sim import Progress
 from us_sim.errors import VolumeError
 from us_sim.volume.segmentation.settings import SegmentationSettings, StructureSeeds
 from us_sim.volume.volume import LabelMap, Volume
-
-Progress = Callable[[float, str], None]
 
 
 def segment_volume(
