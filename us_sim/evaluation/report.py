@@ -19,6 +19,7 @@ from os import cpu_count
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 
 def format_markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -29,6 +30,12 @@ def format_markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) ->
         "| " + " | ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)) + " |"
         for line in lines
     )
+
+
+def read_case(table: pd.DataFrame, case: object, column: str) -> float:
+    """Return a column's value of a case; NaN if it failed."""
+    rows = table[table["case"] == str(case)]
+    return float(rows[column].iloc[0]) if len(rows) else np.nan
 
 
 def compute_percentile(values: Sequence[float] | np.ndarray, percent: float) -> float:

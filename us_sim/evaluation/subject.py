@@ -197,9 +197,9 @@ class Subject:
         return re.sub(r"\n{3,}", "\n\n", "\n\n".join(sections))
 
 
-def format_data_frame(table: pd.DataFrame, form: str = ".3g") -> str:
-    """Format a table in Markdown, its floats in ``form``; missing values are empty."""
-    rows = [[_format_cell(value, form) for value in row] for row in table.astype(object).to_numpy()]
+def format_data_frame(table: pd.DataFrame) -> str:
+    """Format a table in Markdown, its floats with three digits; missing values are empty."""
+    rows = [[_format_cell(cell, ".3g") for cell in row] for row in table.astype(object).to_numpy()]
     return format_markdown_table([str(name) for name in table.columns], rows) if rows else ""
 
 

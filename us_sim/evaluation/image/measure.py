@@ -8,7 +8,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -16,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from us_sim.evaluation.timing import time_in_turn
 from us_sim.geometry.pose import Pose
 from us_sim.scene.building import build_probe, load_volume
 from us_sim.scene.reading import load_scene
@@ -124,13 +124,28 @@ def measure_run_times(quick: bool) -> Iterator[dict[str, Any]]:
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        medians = time_in_turn(
+        medians = _time_in_turn(
             {name: make_imager(acoustics, name == "strain") for name, acoustics in kinds.items()},
-            count=60 if quick else 300,
+            [Pose(np.array([2e-4 * (k % 7), 0.0, press])) for k in range(60 if quick else 300)],
             uncounted=5,
-            prepare=lambda number: Pose(np.array([2e-4 * (number % 7), 0.0, press])),
         )
     finally:
         cv2.setNumThreads(threads)
     for name, ms in medians.items():
         yield make_row(f"run_time_{name}", "linear", np.nan, np.nan, np.nan, ms, "ms")
+
+
+def _time_in_turn(
+    functions: Mapping[str, Callable[[Pose], object]], poses: Sequence[Pose], uncounted: int
+) -> dict[str, float]:
+    """Return the median processor time (ms) of each function, called in turn on a noisy machine.
+
+    Each is called with every pose; the first ``uncounted`` calls may compile, and do not count.
+    """
+    found: dict[str, list[float]] = {name: [] for name in functions}
+    for pose in poses:
+        for name, function in functions.items():
+            began = time.thread_time()
+            function(pose)
+            found[name].append(1e3 * (time.thread_time() - began))
+    return {name: float(np.median(ms[uncounted:])) for name, ms in found.items()}

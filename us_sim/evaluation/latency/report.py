@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 
-import numpy as np
 import pandas as pd
 
 from us_sim.evaluation.latency.measure import BUSY, DEMO, LatencyCase, list_cases, run_case
+from us_sim.evaluation.report import read_case
 from us_sim.evaluation.subject import Piece, Report, Subject, Target
 from us_sim.run.processes import prepare_ros
 
@@ -25,11 +25,7 @@ def _plan_pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
 
 
 def _report(table: pd.DataFrame) -> Report:
-    def get_value(case: LatencyCase, column: str) -> float:
-        """Return the value of a case, of whatever length; NaN if it failed."""
-        rows = table[table["case"] == str(case)]
-        return float(rows[column].iloc[0]) if len(rows) else np.nan
-
+    get_value = partial(read_case, table)
     age, worst = "ultrasound_image_ms_p50", "ultrasound_image_ms_p99"
     growth, lost = get_value(DEMO, "growth_mb_a_minute"), get_value(DEMO, "not_recorded")
     targets = [

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-import numpy as np
 import pandas as pd
 
+from us_sim.evaluation.report import read_case
 from us_sim.evaluation.subject import Piece, Report, Subject, Target
 from us_sim.evaluation.viewer.measure import list_cases, run_case
 from us_sim.run.processes import prepare_ros
@@ -25,11 +25,7 @@ def _plan_pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
 
 def report_viewer(table: pd.DataFrame) -> Report:
     """Report the rates, delays and costs of the page."""
-
-    def get_value(name: str, column: str) -> float:
-        rows = table[table["case"] == name]
-        return float(rows[column].iloc[0]) if len(rows) else np.nan
-
+    get_value = partial(read_case, table)
     browser, hand = "1 browser, path", "1 browser, hand"
     shown = "images_a_second_shown"
     mouse = [get_value(hand, f"delay_ms_{part}") for part in ("median", "p99")]
