@@ -28,7 +28,7 @@ from us_sim.recording.attached_files import extract_files
 from us_sim.recording.path import ProbePath, write_path
 from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import DEFAULT_QOS
-from us_sim.recording.writer import BagWriter, PatientFile
+from us_sim.recording.writer import BagWriter, BufferedFile
 from us_sim.scene.building import load_path
 from us_sim.scene.reading import load_scene
 
@@ -356,7 +356,7 @@ def test_a_further_file_is_begun_only_where_that_is_asked_for(bench, tmp_path):
 @pytest.mark.slow
 def test_a_full_disk_is_said_and_survived(bench, quiet, monkeypatch):
     full = [False]
-    flush = PatientFile.flush
+    flush = BufferedFile.flush
 
     def flush_unless_full(file):
         if full[0]:
@@ -364,7 +364,7 @@ def test_a_full_disk_is_said_and_survived(bench, quiet, monkeypatch):
         else:
             flush(file)
 
-    monkeypatch.setattr(PatientFile, "flush", flush_unless_full)
+    monkeypatch.setattr(BufferedFile, "flush", flush_unless_full)
     monkeypatch.setattr("us_sim.recording.write_behind._RETRY", 0.1)
     recorder, note, _, file = quiet()
     reports = bench.collect(DiagnosticArray, "diagnostics")

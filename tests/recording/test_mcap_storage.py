@@ -96,7 +96,7 @@ def test_seeking_reads_one_chunk(tmp_path, monkeypatch):
     since = EPOCH + 250 * 10**7
     assert next(bag.read_messages(since=since)).log_time == since
     assert len(read) == 1
-    (last,) = bag.read_latest(["/rare"], since)
+    (last,) = bag.read_latest(["/rare"], since, 1)
     assert last.log_time == EPOCH + 157 * 10**7
     assert len(read) <= 5  # those with rare messages
 

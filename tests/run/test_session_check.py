@@ -10,7 +10,6 @@ from session_files import EPOCH, PERIOD, TYPES, press, write
 from us_sim.command.main import main
 from us_sim.recording.reader import read_bag
 from us_sim.recording.schemas import serialize_stamped
-from us_sim.recording.stamps import make_stamp_reader
 from us_sim.recording.topic import DEFAULT_QOS
 from us_sim.recording.writer import BagWriter
 from us_sim.run.session_check import check_bag
@@ -60,7 +59,7 @@ def test_stamps_are_those_that_rosbags_decodes(shared_data):
     seen = set()
     for message in bag.read_messages():
         topic = bag.find_topic(message.topic)
-        reader = make_stamp_reader(bag, topic)
+        reader = bag.make_stamp_reader(topic)
         decoded = bag.deserialize(message)
         header = getattr(decoded, "header", None) or (
             decoded.transforms[0].header if topic.name == "/tf" else None
@@ -75,7 +74,7 @@ def test_stamps_are_those_that_rosbags_decodes(shared_data):
 
 def test_a_big_endian_stamp_is_read(tmp_path):
     bag = read_bag(write(tmp_path / "s.mcap", press(1)))
-    reader = make_stamp_reader(bag, bag.find_topic("/probe/pose"))
+    reader = bag.make_stamp_reader(bag.find_topic("/probe/pose"))
     assert reader(b"\0\0\0\0" + struct.pack(">iI", 7, 5)) == 7 * 10**9 + 5
 
 

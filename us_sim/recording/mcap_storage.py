@@ -110,7 +110,7 @@ class McapStorage:
                         if since is None or each[0] >= since:
                             heapq.heappush(pending, each)
                 except _DAMAGE as error:
-                    broken = self._damaged(f"chunk at byte {run.offset}", error)
+                    broken = self._describe_damage(f"chunk at byte {run.offset}", error)
                     if damage is None:
                         break
                     damage.append(broken)
@@ -119,7 +119,7 @@ class McapStorage:
         if broken and damage is None:
             raise BagError(broken)
 
-    def _damaged(self, part: str, error: Exception) -> str:
+    def _describe_damage(self, part: str, error: Exception) -> str:
         return f"{self._path} is damaged in its {part}: {error}; {REMEDY}"
 
     def _read_index(self, stream: BinaryIO) -> bool:
@@ -151,7 +151,7 @@ class McapStorage:
             try:
                 self._add(offset, record)
             except _DAMAGE as error:
-                self.fault = self._damaged(f"record at byte {offset}", error)
+                self.fault = self._describe_damage(f"record at byte {offset}", error)
         return True
 
     def _walk(self, stream: BinaryIO) -> None:
@@ -189,15 +189,15 @@ class McapStorage:
             if opcode == Opcode.MESSAGE:
                 heads.append(_MESSAGE.unpack_from(content))
             elif opcode == Opcode.SCHEMA:
-                schema = _parsed(Schema, content)
+                schema = _parse(Schema, content)
                 self._schemas[schema.id] = schema
             elif opcode == Opcode.CHANNEL:
-                channel = _parsed(Channel, content)
+                channel = _parse(Channel, content)
                 self._channels[channel.id] = channel
             elif opcode == Opcode.METADATA:
-                self.notes.append(_parsed(Metadata, content))
+                self.notes.append(_parse(Metadata, content))
             elif opcode == Opcode.ATTACHMENT:
-                self.attachments.append(_parsed(Attachment, content))
+                self.attachments.append(_parse(Attachment, content))
         if heads:
             times = [time for _, _, time, _ in heads]
             counts = Counter(channel for channel, *_ in heads)
@@ -226,7 +226,7 @@ def _record_at(stream: BinaryIO, offset: int, length: int) -> bytes:
     return stream.read(min(length, size))
 
 
-def _parsed(kind: Any, content: memoryview) -> Any:
+def _parse(kind: Any, content: memoryview) -> Any:
     return kind.read(ReadDataStream(BytesIO(content)))
 
 
@@ -243,7 +243,7 @@ def _records_in(record: bytes) -> Iterator[tuple[int, memoryview]]:
     *_, crc, name = _CHUNK.unpack_from(content)
     held, position = content[_CHUNK.size + name + _LENGTH :], 0
     if name:  # of a compression
-        stream, size = get_chunk_data_stream(_parsed(Chunk, content), validate_crc=True)
+        stream, size = get_chunk_data_stream(_parse(Chunk, content), validate_crc=True)
         held = memoryview(stream.read(size))
     elif crc and zlib.crc32(held) != crc:  # here, since mcap copies what is not compressed
         raise ValueError("its checksum does not match")

@@ -129,7 +129,7 @@ def list_bodies(bag: Bag) -> dict[str, list[str]]:
             continue
         names = {topic.name: None}
         if topic.type_name in (_POSE_ARRAY, _TF):
-            names = {f"{topic.name}:{body}": None for body, _ in _each(bag, topic)}
+            names = {f"{topic.name}:{body}": None for body, _ in _iter_poses(bag, topic)}
         found.setdefault(topic.type_name, []).extend(names)
     return found
 
@@ -154,7 +154,7 @@ def read_pose_rows(bag: Bag, name: str) -> Iterator[RecordedPose]:
         yield from _chained(bag, topic, body, parent)
         return
     found: dict[str, None] = {}
-    for other, row in _each(bag, topic):
+    for other, row in _iter_poses(bag, topic):
         found[other] = None
         if other == body:
             yield row
@@ -163,7 +163,7 @@ def read_pose_rows(bag: Bag, name: str) -> Iterator[RecordedPose]:
         raise BagError(f"{bag.path} has no {name}; it has {names}")
 
 
-def _each(bag: Bag, topic: BagTopic) -> Iterator[tuple[str, RecordedPose]]:
+def _iter_poses(bag: Bag, topic: BagTopic) -> Iterator[tuple[str, RecordedPose]]:
     """Yield every pose of a topic's messages, after the body that it is of."""
     poses = _POSES[topic.type_name]
     for raw in bag.read_messages([topic.name]):
@@ -182,7 +182,7 @@ def _chained(bag: Bag, topic: BagTopic, body: str, parent: str) -> Iterator[Reco
     chain, is_empty = FrameChain(body, parent), True
     static = f"{topic.name}_static"
     for name in [each.name for each in bag.topics if each.name == static] + [topic.name]:
-        for frame, row in _each(bag, bag.find_topic(name)):
+        for frame, row in _iter_poses(bag, bag.find_topic(name)):
             numbers = np.array(row.pose)
             if not are_poses(numbers[None])[0]:
                 continue
@@ -237,7 +237,7 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
         of_probe = [each for each in poses if each.endswith("/probe/pose") and each != name]
         if len(of_probe) == 1:
             name, rows = of_probe[0], list(read_pose_rows(bag, of_probe[0]))
-    return _usable(bag, name, rows)
+    return _make_path(bag, name, rows)
 
 
 def is_tracker_recording(path: str | Path) -> bool:
@@ -325,7 +325,7 @@ def _frames(rows: list[RecordedPose]) -> list[str]:
     return list(dict.fromkeys(row.frame_id for row in rows))
 
 
-def _usable(bag: Bag, name: str, rows: list[RecordedPose]) -> ProbePath:
+def _make_path(bag: Bag, name: str, rows: list[RecordedPose]) -> ProbePath:
     """Return the poses of one frame that can be used."""
     if not rows:
         raise BagError(f"{bag.path} holds no pose on {name}; {bag.fault or 'it is silent'}")

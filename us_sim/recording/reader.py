@@ -5,23 +5,26 @@ from __future__ import annotations
 import contextlib
 import heapq
 from collections import Counter, defaultdict, deque
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import zstandard
-from rosbags.interfaces import Qos
+from rosbags.interfaces import Nodetype, Qos
 from rosbags.typesys.store import Typestore
 
 from us_sim.errors import BagError, printable_line
 from us_sim.recording import MARKER
+from us_sim.recording.decoding import read_first_stamp, read_stamp
 from us_sim.recording.metadata import METADATA, missing_files
 from us_sim.recording.schemas import load_jazzy_definitions, parse_definitions
 from us_sim.recording.storage import Storage, find_bag_files, open_storage
 from us_sim.recording.topic import LOST, BagMessage, BagTopic
 from us_sim.settings.spelling import align_columns
+
+_HEADER = (Nodetype.NAME, "std_msgs/msg/Header")
 
 
 class Bag:
@@ -113,9 +116,9 @@ class Bag:
             {self.find_topic(name).name for name in topics} if topics is not None else self._topics
         )
         streams = [storage.read_messages(names, damage, since) for storage in self._storages]
-        yield from map(_unpacked, heapq.merge(*streams, key=lambda message: message.log_time))
+        yield from map(_unpack, heapq.merge(*streams, key=lambda message: message.log_time))
 
-    def read_latest(self, topics: Collection[str], before: int, count: int = 1) -> list[BagMessage]:
+    def read_latest(self, topics: Collection[str], before: int, count: int) -> list[BagMessage]:
         """Return the last messages of each topic before a time, in the order of log times.
 
         Args:
@@ -173,9 +176,33 @@ class Bag:
             )
         return store
 
+    def make_stamp_reader(self, topic: BagTopic) -> Callable[[bytes], int | None] | None:
+        """Return a function from a message's bytes to its stamp in ns; None where it has no header.
 
-def _unpacked(message: BagMessage) -> BagMessage:
-    """Return the message, unpacked where rosbag2 compressed each one by itself.
+        The type must begin with a header, or with a sequence of such, of which the first counts, as
+        in tf. The function gives None for an empty sequence.
+
+        The function raises struct.error for a message that is too short to have a stamp.
+        """
+        try:
+            fields = self.find_definitions(topic).fielddefs if topic.encoding == "cdr" else {}
+        except BagError:
+            return None
+
+        def first_field(type_name: str) -> Any:
+            _, own = fields.get(type_name, (None, []))
+            return own[0][1] if own else (None, None)
+
+        kind, content = first_field(topic.type_name)
+        if (kind, content) == _HEADER:
+            return read_stamp
+        if kind == Nodetype.SEQUENCE and content[0][0] == Nodetype.NAME:
+            return read_first_stamp if first_field(content[0][1]) == _HEADER else None
+        return None
+
+
+def _unpack(message: BagMessage) -> BagMessage:
+    """Unpack a message where rosbag2 compressed each one by itself.
 
     A frame of zstd is known by its first bytes, which no CDR has.
     """

@@ -27,7 +27,7 @@ _CHUNK_SIZE = 2 * 1024 * 1024  # bytes; the writer keeps an index of each chunk 
 _COMPRESSIONS = {"none": CompressionType.NONE, "zstd": CompressionType.ZSTD}
 
 
-class PatientFile:
+class BufferedFile:
     """A new file that takes every byte: what the disk has no room for waits in memory.
 
     Where a write fails the file is cut back to the last one that succeeded, so that it holds whole
@@ -142,7 +142,7 @@ class BagWriter:
         try:
             self.path, self._metadata_file = _names(Path(path), sidecar, further)
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = PatientFile(self.path, reserve)
+            self._file = BufferedFile(self.path, reserve)
         except (OSError, ValueError) as error:  # ValueError: a name that no file can have
             raise _cannot_be_made(path, error) from None
         stream: Any = self._file  # which has what a Writer asks of one

@@ -17,7 +17,6 @@ from us_sim.errors import printable_line
 from us_sim.nodes.settings import AnnotatedImageSettings
 from us_sim.nodes.topics import TOPICS
 from us_sim.recording.reader import Bag
-from us_sim.recording.stamps import make_stamp_reader
 from us_sim.recording.topic import BagTopic
 from us_sim.run.session_tables import SECOND, read_times
 from us_sim.settings.spelling import align_columns, format_count
@@ -84,7 +83,7 @@ class TopicCheck:
     ) -> None:
         self.topic, self.messages, self._poses = topic, messages, poses
         self._start, self._is_cut = bag.start or 0, bool(bag.fault)
-        self._is_timed = make_stamp_reader(bag, topic) is not None and not topic.is_latched
+        self._is_timed = bag.make_stamp_reader(topic) is not None and not topic.is_latched
         self.findings: list[Finding] = []
         self.missing = self._check_numbers(bag.count_losses()[topic.name], is_numbered)
         self._check_order()

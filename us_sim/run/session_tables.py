@@ -21,7 +21,6 @@ from us_sim.recording.attached_files import new_file
 from us_sim.recording.lerobot_writer import POSE_PARTS, WRENCH_PARTS
 from us_sim.recording.path import POSE_STAMPED, list_bodies, read_pose_rows
 from us_sim.recording.reader import Bag
-from us_sim.recording.stamps import make_stamp_reader
 
 SECOND = 1_000_000_000  # ns
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
@@ -44,7 +43,7 @@ def read_times(
         BagError: the bag is damaged, and ``faults`` is None; or it has no such topic.
     """
     chosen = bag.topics if topics is None else [bag.find_topic(name) for name in topics]
-    readers = {topic.name: make_stamp_reader(bag, topic) for topic in chosen}
+    readers = {topic.name: bag.make_stamp_reader(topic) for topic in chosen}
     values = {name: array("q") for name in readers}
     total = max(sum(topic.message_count for topic in chosen), 1)
     messages = bag.read_messages(topics) if faults is None else bag.read_all_messages(faults)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -13,6 +12,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image, PointCloud2
 
 from us_sim.nodes.qos import EVERY
+from us_sim.recording.decoding import read_stamp
 
 HOPS = {
     "tracker/pose": PoseStamped,
@@ -22,14 +22,6 @@ HOPS = {
     "ultrasound/image": Image,
 }
 """Topics that carry the stamp of the tracker's pose, in the order of the graph."""
-
-_HEADER = struct.Struct("<4xiI")  # the stamp of a serialized message with a header
-
-
-def read_stamp(data: bytes) -> int:
-    """Read the stamp (ns) of a serialized message with a header."""
-    seconds, nanoseconds = _HEADER.unpack_from(data)
-    return int(1_000_000_000 * seconds + nanoseconds)
 
 
 class Arrivals(Node):  # type: ignore[misc]

@@ -27,6 +27,7 @@ from us_sim.evaluation.processes import (
     run_simulator,
 )
 from us_sim.evaluation.report import compute_percentile
+from us_sim.recording.decoding import read_stamp
 from us_sim.recording.reader import read_bag
 from us_sim.share import find_bag
 
@@ -79,8 +80,6 @@ def run_case(case: LatencyCase) -> list[dict[str, Any]]:
     Raises:
         UsSimError: the simulation ends, or no image comes.
     """
-    from us_sim.evaluation.latency.arrivals import read_stamp
-
     with tempfile.TemporaryDirectory(prefix="us_sim_latency_") as name:
         scene, session = Path(name) / "scene.yaml", Path(name) / "session.mcap"
         size = f"[{case.image.replace('x', ', ')}]"
