@@ -36,12 +36,7 @@ class CalibrationSettings(Settings):
 
     def check(self) -> None:
         """Refuse a file that exists or cannot be written, before the work."""
-        if self.out.suffix.lower() not in (".yaml", ".yml"):
-            raise self.make_error("out", f"{self.out}: must be a file that ends in .yaml")
-        if self.out.exists():
-            raise self.make_error("out", f"{self.out}: exists already; choose another name")
-        if not self.out.absolute().parent.is_dir():
-            raise self.make_error("out", f"{self.out}: there is no {self.out.absolute().parent}")
+        self.require_new_file("out", ".yaml", ".yml")
 
 
 @dataclass(frozen=True)

@@ -48,13 +48,7 @@ class PressSettings(Settings):
 
     def check(self) -> None:
         """Refuse files that exist, before the work."""
-        if self.out.suffix.lower() != ".csv":
-            raise self.make_error("out", f"{self.out}: must be a file that ends in .csv")
-        for file in (self.out, self.out.with_suffix(".png")):
-            if file.exists():
-                raise self.make_error("out", f"{file}: exists already; choose another name")
-        if not self.out.absolute().parent.is_dir():
-            raise self.make_error("out", f"{self.out}: there is no {self.out.absolute().parent}")
+        self.require_new_file("out", ".csv", picture=True)
 
 
 def press_options(parser: argparse.ArgumentParser) -> None:

@@ -79,10 +79,8 @@ class Quantity:
         if not math.isfinite(number):
             raise ValueError(f"{short_repr(value)} is not finite; give {self._range}")
         if not self.minimum <= number <= self.maximum:
-            unit = f" {self.unit}" if self.unit else ""
-            raise ValueError(
-                f"{number:g}{unit} is outside {self._range}{self._suggest_unit(number)}"
-            )
+            given = f"{number:g} {self.unit}".rstrip()
+            raise ValueError(f"{given} is outside {self._range}{self._suggest_unit(number)}")
         return number
 
     def _read_number(self, value: object) -> float:
@@ -91,21 +89,14 @@ class Quantity:
         if not isinstance(value, str):
             # A whole number may be larger than any that a float holds.
             return float(value) if abs(value) < 1e308 else math.inf
-        match = _NUMBER.match(value)
-        units = _UNITS[self.dimension]
-        if match is None:
+        match, sizes = _NUMBER.match(value), {"": 1.0} | _UNITS[self.dimension]
+        if match is None or match[2] not in sizes:
             raise ValueError(self._describe_misfit(value))
-        number, unit = float(match[1]), match[2]
-        if not unit:
-            return number
-        if unit not in units:
-            raise ValueError(self._describe_misfit(value))
-        return number * units[unit]
+        return float(match[1]) * sizes[match[2]]
 
     @property
     def _range(self) -> str:
-        unit = f" {self.unit}" if self.unit else ""
-        return f"{self.minimum:g} to {self.maximum:g}{unit}"
+        return f"{self.minimum:g} to {self.maximum:g} {self.unit}".rstrip()
 
     def _describe_misfit(self, value: object) -> str:
         """Say what a value should have been: the dimension and its units."""
@@ -152,8 +143,7 @@ _EXACT = 1e-12
 
 def format_quantity(value: float, dimension: str) -> str:
     """Write a number with its unit, so that `Quantity.parse` reads it."""
-    number, unit = _choose_unit(value, dimension)
-    return f"{number} {unit}" if unit else number
+    return " ".join(_choose_unit(value, dimension)).rstrip()
 
 
 def format_range(quantity: Quantity) -> str:
@@ -210,12 +200,10 @@ def _in_unit(value: float, dimension: str, unit: str) -> str | None:
 
 
 def _format_number(value: float) -> str:
-    text = f"{value:.6g}"
-    if float(text) != value:
-        text = repr(value)
     if value == int(value) and abs(value) < 1e8:
-        text = str(int(value))
-    return _tidy(text)
+        return str(int(value))
+    text = f"{value:.6g}"
+    return _tidy(text if float(text) == value else repr(value))
 
 
 def _tidy(text: str) -> str:

@@ -21,6 +21,7 @@ import dataclasses
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import UnionType
 from typing import Any, ClassVar, Union, get_args, get_origin
 
@@ -130,6 +131,17 @@ class Settings:
 
     def check(self) -> None:
         """Refuse values that do not go together."""
+
+    def require_new_file(self, key: str, *endings: str, picture: bool = False) -> None:
+        """Refuse a file to write that ends otherwise, exists (or its PNG), or is in no folder."""
+        file: Path = getattr(self, key)
+        if file.suffix.lower() not in endings:
+            raise self.make_error(key, f"{file}: must be a file that ends in {endings[0]}")
+        for each in (file, file.with_suffix(".png")) if picture else (file,):
+            if each.exists():
+                raise self.make_error(key, f"{each}: exists already; choose another name")
+        if not file.absolute().parent.is_dir():
+            raise self.make_error(key, f"{file}: there is no {file.absolute().parent}")
 
     def make_error(self, key: str, problem: str) -> UsSimError:
         """Make the error for a wrong value of one of these settings."""

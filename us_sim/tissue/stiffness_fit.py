@@ -75,13 +75,7 @@ class StiffnessSettings(Settings):
 
     def check(self) -> None:
         """Refuse files that exist, before the work."""
-        if self.out.suffix.lower() not in (".yaml", ".yml"):
-            raise self.make_error("out", f"{self.out}: must be a file that ends in .yaml")
-        for file in (self.out, self.out.with_suffix(".png")):
-            if file.exists():
-                raise self.make_error("out", f"{file}: exists already; choose another name")
-        if not self.out.absolute().parent.is_dir():
-            raise self.make_error("out", f"{self.out}: there is no {self.out.absolute().parent}")
+        self.require_new_file("out", ".yaml", ".yml", picture=True)
 
 
 @dataclass(frozen=True, eq=False)
