@@ -12,10 +12,10 @@ from us_sim import Progress
 from us_sim.command.volume_pictures import draw_slices
 from us_sim.errors import VolumeError
 from us_sim.settings.setting import Settings, setting
-from us_sim.volume.cases.proposal import on_skin
+from us_sim.volume.cases.proposal import move_to_skin
 from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.cases.writing import new_case, write_case_settings
-from us_sim.volume.files.writing import VOLUME_ENDINGS, write_volume
+from us_sim.volume.files.writing import VOLUME_ENDINGS, explain_volume_ending, write_volume
 from us_sim.volume.reconstruction.calibration_file import SweepCalibration, read_calibration
 from us_sim.volume.reconstruction.reconstruction import Rest, plan_insertion, reconstruct
 from us_sim.volume.reconstruction.scanning_probe import find_scanning_probe
@@ -47,12 +47,8 @@ class SweepSettings(Settings):
         for path in (self.out, self.picture):
             if path.exists():
                 raise self.make_error("out", f"{path}: exists already; choose another name")
-        if not self.is_volume and 1 < len(self.out.suffix) <= 5:
-            raise self.make_error(
-                "out",
-                f"{self.out}: its name ends as no volume's does; write "
-                f"{', '.join(VOLUME_ENDINGS)}, or a folder's name without an ending for a case",
-            )
+        if problem := explain_volume_ending(self.out):
+            raise self.make_error("out", problem)
         if self.is_volume and not self.out.absolute().parent.is_dir():
             raise self.make_error("out", f"{self.out}: there is no {self.out.absolute().parent}")
 
@@ -66,9 +62,7 @@ class SweepSettings(Settings):
         """The file of the picture, beside the volume or in the case."""
         if not self.is_volume:
             return self.out / "volume.png"
-        ending = max(
-            (end for end in VOLUME_ENDINGS if self.out.name.lower().endswith(end)), key=len
-        )
+        ending = next(end for end in VOLUME_ENDINGS if self.out.name.lower().endswith(end))
         return self.out.with_name(f"{self.out.name[: -len(ending)]}.png")
 
 
@@ -117,7 +111,7 @@ def reconstruct_sweep(
             write_volume(folder / "volume.nrrd", made.volume)
             scanned = scanner.poses
             if planned.rest:  # what they pressed lies at rest
-                scanned = tuple(on_skin(each, made.volume, scanner.probe) for each in scanned)
+                scanned = tuple(move_to_skin(each, made.volume, scanner.probe) for each in scanned)
             case = CaseSettings(name=settings.out.name, probe=scanner.probe, scanned=scanned)
             write_case_settings(folder, case)
             draw_slices(folder / picture.name, made.volume, made.covered, size)

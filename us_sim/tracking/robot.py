@@ -69,7 +69,7 @@ def compute_approach_speed(wanted: float, felt: float, damping: float, most: flo
 
 @dataclass(frozen=True)
 class RobotSettings(Settings):
-    """Of ``probe_robot``: how the arm moves, and where it may."""
+    """Settings of the robot arm: limits of its motion and of its reach."""
 
     error = TrackingError
 

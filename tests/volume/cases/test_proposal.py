@@ -10,7 +10,7 @@ from us_sim.geometry.pose import Placement, Pose
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.choice import ChosenOption
 from us_sim.settings.registry import PROBES
-from us_sim.volume.cases.proposal import complete_settings, on_skin
+from us_sim.volume.cases.proposal import complete_settings, move_to_skin
 from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.volume import Volume
 
@@ -108,7 +108,7 @@ def test_a_pose_above_or_inside_is_put_on_the_skin_along_its_own_axis(depth):
     volume = curved_block(0.0)
     volume = replace(volume, index_to_patient=turn.matrix @ volume.index_to_patient)
     start = turn @ Pose([0.0, 0.0, depth])
-    moved = on_skin(Placement(tuple(start.position), tuple(start.orientation)), volume, None)
+    moved = move_to_skin(Placement(tuple(start.position), tuple(start.orientation)), volume, None)
     np.testing.assert_allclose(
         moved.position, turn.transform_points(np.array([[0, 0, 0.0195]]))[0], atol=5e-4
     )

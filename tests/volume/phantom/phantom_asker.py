@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from us_sim.volume.phantom.phantom import load_or_make_volume, make_upper_arm
+from us_sim.cache import load_or_create
+from us_sim.volume.phantom.phantom import make_upper_arm, pack_volume, unpack_volume
 from us_sim.volume.volume import Volume
 
 
@@ -17,5 +18,5 @@ def ask(cache: str, marks: str, start, answers) -> None:
         return make_upper_arm(1, 1.5e-3)
 
     start.wait()
-    volume = load_or_make_volume("arm", make)
+    volume = load_or_create("arm", pack_volume, unpack_volume, make)
     answers.put(int(volume.intensities.sum(dtype=np.int64)))

@@ -3,16 +3,24 @@
 import logging
 import multiprocessing
 import os
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from phantom_asker import ask
 
-from us_sim.volume.phantom.phantom import load_or_make_phantom, load_or_make_volume, make_upper_arm
+from us_sim.cache import load_or_create
+from us_sim.volume.phantom.phantom import (
+    load_or_make_phantom,
+    make_upper_arm,
+    pack_volume,
+    unpack_volume,
+)
 from us_sim.volume.volume import Volume
 
 COARSE = 2e-3
+load_small = partial(load_or_create, "small", pack_volume, unpack_volume)
 
 
 @pytest.fixture
@@ -50,9 +58,9 @@ def test_a_phantom_comes_back_as_it_was_made():
 def test_what_a_killed_process_left_is_cleared_away_and_kept_arrays_are_not_copied(cache):
     left_over = cache / "small.partial"
     left_over.mkdir(parents=True)
-    load_or_make_volume("small", _small)
+    load_small(_small)
     assert not left_over.exists()
-    base = load_or_make_volume("small", _unused).labels
+    base = load_small(_unused).labels
     while not isinstance(base, np.memmap):
         base = base.base
     assert Path(base.filename).parent == cache / "small"
@@ -66,21 +74,21 @@ def test_what_a_killed_process_left_is_cleared_away_and_kept_arrays_are_not_copi
     ],
 )
 def test_a_damaged_entry_is_made_again_with_a_word(cache, caplog, damage):
-    load_or_make_volume("small", _small)
+    load_small(_small)
     damage(cache / "small")
     with caplog.at_level(logging.WARNING):
-        mended = load_or_make_volume("small", _small)
+        mended = load_small(_small)
     assert "is damaged" in caplog.text
     assert "made again" in caplog.text
     np.testing.assert_array_equal(mended.labels, _small().labels)
-    np.testing.assert_array_equal(load_or_make_volume("small", _unused).labels, _small().labels)
+    np.testing.assert_array_equal(load_small(_unused).labels, _small().labels)
 
 
 def test_a_cache_that_cannot_be_written_costs_only_a_warning(tmp_path, monkeypatch, caplog):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("US_SIM_CACHE", str(tmp_path / "file" / "cache"))
     with caplog.at_level(logging.WARNING):
-        volume = load_or_make_volume("small", _small)
+        volume = load_small(_small)
     assert "cannot be written" in caplog.text
     np.testing.assert_array_equal(volume.intensities, _small().intensities)
 

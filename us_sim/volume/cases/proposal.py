@@ -52,7 +52,7 @@ def complete_settings(settings: CaseSettings, volume: Volume) -> CaseSettings:
         seen_by = probe or _probe_at(poses[len(poses) // 2], points)
         pose = _showing_most(settings, volume, poses, seen_by)
         at = round_pose(pose)
-        at = at if settings.scanned else on_skin(at, volume, seen_by)
+        at = at if settings.scanned else move_to_skin(at, volume, seen_by)
         start = CaseStart(at.position, at.orientation, proposed=True)
     probe = probe or _probe_at(start.pose, points)
     if probe.collider is None:
@@ -101,7 +101,7 @@ def _probe_at(pose: Pose, points: NDArray[np.float64]) -> ProbeSettings:
     return ProbeSettings(array=array, image=512)
 
 
-def on_skin(start: Placement, volume: Volume, probe: ProbeSettings | None) -> Placement:
+def move_to_skin(start: Placement, volume: Volume, probe: ProbeSettings | None) -> Placement:
     """Move a probe along its z to where its face touches what was scanned, and presses nothing.
 
     Specks, below which there is mostly nothing within 2 mm, do not hold it off.

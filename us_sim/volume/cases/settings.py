@@ -122,7 +122,7 @@ class CaseSettings(Settings):
     )
 
     def check(self) -> None:
-        """Names are names, and no two structures are one label."""
+        """Refuse names that no file can have, reserved names, and labels of two structures."""
         if problem := check_name(self.name):
             raise self.make_error("name", problem)
         seen: dict[int, str] = {}

@@ -37,7 +37,7 @@ from us_sim.volume.files.dicom.placed_images import open_images, place_images
 from us_sim.volume.files.labels import refuse_segments
 from us_sim.volume.files.readers import ENDINGS, open_image
 from us_sim.volume.files.stored_image import read_grey_voxels, stack_slices
-from us_sim.volume.files.writing import VOLUME_ENDINGS, write_volume
+from us_sim.volume.files.writing import VOLUME_ENDINGS, explain_volume_ending, write_volume
 from us_sim.volume.partial_file import partial_file
 from us_sim.volume.volume import Volume
 
@@ -162,11 +162,8 @@ def plan_import(
         paths += find_dicom_files(each) if each.is_dir() else [each]
     if out is not None and os.path.lexists(out):
         raise VolumeError(f"{out}: exists already; choose another name, or remove it")
-    if out and 1 < len(out.suffix) <= 5 and not out.name.lower().endswith(VOLUME_ENDINGS):
-        raise VolumeError(
-            f"{out}: its name ends as no volume's does; write {', '.join(VOLUME_ENDINGS)}, or a "
-            f"folder's name without an ending for a case"
-        )
+    if out is not None and (problem := explain_volume_ending(out)):
+        raise VolumeError(problem)
     path, source = paths[0], _source(paths, settings)
     columns, rows, _ = source.shape
     whole = PixelRectangle(0, 0, columns - 1, rows - 1)

@@ -26,7 +26,7 @@ class PixelRectangle(NamedTuple):
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Of (rows, columns)."""
+        """Slices that cut the rectangle out of an image (rows, columns)."""
         return slice(self.top, self.bottom + 1), slice(self.left, self.right + 1)
 
     def intersect(self, other: PixelRectangle) -> PixelRectangle | None:

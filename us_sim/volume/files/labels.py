@@ -268,13 +268,13 @@ def resample_labels(
             f"their axes were taken for others (left-posterior-superior is meant)"
         )
     if not is_same:
-        sizes = _words(labels.shape, placement), _words(shape, wanted)
+        sizes = _describe_grid(labels.shape, placement), _describe_grid(shape, wanted)
         return made, [f"labels of {sizes[0]} were resampled to {sizes[1]} by the nearest voxel"]
     lost = f"{before - after} of {before} labelled voxels lie outside the volume and are left out"
     return made, [lost] if before > after else []
 
 
-def _words(shape: tuple[int, ...], placement: NDArray[np.float64]) -> str:
+def _describe_grid(shape: tuple[int, ...], placement: NDArray[np.float64]) -> str:
     sides = np.linalg.norm(placement[:3, :3], axis=0) * 1e3
     return (
         f"{' × '.join(map(str, shape))} voxels of {' × '.join(f'{side:.3g}' for side in sides)} mm"

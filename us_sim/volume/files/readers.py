@@ -69,7 +69,7 @@ def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
 
 
 def open_image(path: Path, *, layers: bool = False) -> StoredImage:
-    """Describe the image of a MetaImage, NRRD or NIfTI file by its header.
+    """Read the header of a MetaImage, NRRD or NIfTI file; its voxels are read on demand.
 
     With ``layers`` a voxel may have several numbers, as in segmentations of 3D Slicer.
 

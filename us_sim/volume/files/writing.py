@@ -26,6 +26,16 @@ VOLUME_ENDINGS = (".nrrd", ".mha", ".nii.gz", ".nii")
 _LEVEL = 1  # of compression: speckle hardly becomes smaller with any other
 
 
+def explain_volume_ending(path: Path) -> str:
+    """Return why a name can be neither a volume's nor a case's; "" if it can."""
+    if path.name.lower().endswith(VOLUME_ENDINGS) or not 1 < len(path.suffix) <= 5:
+        return ""
+    return (
+        f"{path}: its name ends as no volume's does; write {', '.join(VOLUME_ENDINGS)}, or a "
+        f"folder's name without an ending for a case"
+    )
+
+
 def write_volume(path: str | os.PathLike[str], volume: Volume) -> None:
     """Write the grey values of a volume; a file of that name is replaced.
 

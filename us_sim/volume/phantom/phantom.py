@@ -142,20 +142,12 @@ def load_or_make_phantom(
     """
     make: Callable[[int, float, Progress | None], Volume] = PHANTOMS.load(name)
     key = _key(name, seed, voxel_size)
-    return load_or_make_volume(key, lambda: make(seed, voxel_size, progress))
+    return load_or_create(key, pack_volume, unpack_volume, lambda: make(seed, voxel_size, progress))
 
 
 def is_phantom_cached(name: str, seed: int, voxel_size: float) -> bool:
     """Tell whether a phantom is in the user's cache folder; it may be damaged."""
     return (cache_folder() / _key(name, seed, voxel_size)).is_dir()
-
-
-def load_or_make_volume(key: str, make: Callable[[], Volume]) -> Volume:
-    """Load the labelled volume cached under a key, made first by one process if it is not there.
-
-    The key is a file name that contains everything on which the volume's bytes depend.
-    """
-    return load_or_create(key, _pack, _unpack, make)
 
 
 def _key(name: str, seed: int, voxel_size: float) -> str:
@@ -164,7 +156,8 @@ def _key(name: str, seed: int, voxel_size: float) -> str:
     return f"{name}-{hashlib.sha256(decided_by.encode()).hexdigest()[:16]}"
 
 
-def _pack(volume: Volume) -> tuple[dict[str, NDArray], dict[str, Any]]:
+def pack_volume(volume: Volume) -> tuple[dict[str, NDArray], dict[str, Any]]:
+    """Take a labelled volume apart, for the cache."""
     assert volume.labels is not None  # phantoms are labelled
     return {"intensities": volume.intensities, "labels": volume.labels}, {
         "index_to_patient": volume.index_to_patient.tolist(),
@@ -172,7 +165,8 @@ def _pack(volume: Volume) -> tuple[dict[str, NDArray], dict[str, Any]]:
     }
 
 
-def _unpack(arrays: dict[str, NDArray], facts: dict[str, Any]) -> Volume:
+def unpack_volume(arrays: dict[str, NDArray], facts: dict[str, Any]) -> Volume:
+    """Make a volume of what `pack_volume` returned."""
     return Volume(
         arrays["intensities"],
         np.array(facts["index_to_patient"]),

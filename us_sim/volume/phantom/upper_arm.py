@@ -90,11 +90,11 @@ def compute_envelope(
     return np.sqrt(square, out=square)
 
 
-def log_compress(envelope: NDArray[np.float32], dynamic_range: float = 60.0) -> NDArray[np.uint8]:
-    """Return an envelope as grey values: 255 at 1 and above, 0 ``dynamic_range`` dB below it."""
+def log_compress(envelope: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return an envelope as grey values: 255 at 1 and above, 0 at 60 dB below it."""
     grey = np.maximum(envelope, np.float32(1e-6))
     np.log10(grey, out=grey)
-    grey *= np.float32(20.0 * 255.0 / dynamic_range)
+    grey *= np.float32(20.0 * 255.0 / 60.0)
     grey += np.float32(255.5)
     return np.clip(grey, 0.0, 255.0, out=grey).astype(np.uint8)
 
