@@ -98,9 +98,9 @@ def _extract(args: argparse.Namespace) -> int:
 
 def _to_lerobot(args: argparse.Namespace) -> int:
     from us_sim.progress import late_progress
-    from us_sim.run.session_lerobot import write_lerobot
+    from us_sim.run.session_lerobot import convert_sessions
 
-    lines = write_lerobot(
+    lines = convert_sessions(
         args.files,
         args.out,
         args.task,

@@ -163,10 +163,10 @@ def make_dataset(
         print(f"{name} failed: {error}")
     is_video, whole = _FORMATS[settings.format], {n: made[n] for n in made.keys() - failed}
     if is_video is not None and whole:
-        from us_sim.environment.lerobot_episodes import write_lerobot
+        from us_sim.environment.lerobot_episodes import convert_shards
 
         folder, period = out / settings.format, loaded[0].episode.period
-        write_lerobot(folder, out, whole, settings.task, period, is_video=is_video)
+        convert_shards(folder, out, whole, settings.task, period, is_video=is_video)
         print(folder)
     return int(bool(failed))
 

@@ -37,7 +37,7 @@ _USED = ("image.png", "labels.png", "json")
 _Step = Mapping[str, Any]  # files by their endings; of "json", the object
 
 
-def write_lerobot(
+def convert_shards(
     folder: Path,
     shards: Path,
     episodes: Mapping[str, Mapping[str, Any]],

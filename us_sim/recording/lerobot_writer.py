@@ -60,10 +60,9 @@ def write_episodes(
         is_video: code ``observation.images.…`` as video, which loses speckle.
 
     Raises:
-        EpisodeError: lerobot is not installed, the folder is there or cannot be written, or an
+        EpisodeError: lerobot cannot be used, the folder is there or cannot be written, or an
             episode is unlike the first.
     """
-    require_lerobot()
     if folder.exists():
         raise EpisodeError(f"{folder} exists already: choose another folder")
     try:

@@ -53,7 +53,7 @@ _MOST_FRAMES = 10_000_000
 _LATE = SECOND  # ns that a stamp may be older than one before; more is another time
 
 
-def write_lerobot(
+def convert_sessions(
     sessions: Sequence[Path],
     folder: Path,
     task: str,
