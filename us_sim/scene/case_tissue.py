@@ -201,10 +201,7 @@ def _cache_key(scene: Scene) -> str:
     assert scene.volume.case is not None
     mesh, pose, folder = scene.tissue.mesh, scene.volume.pose, Path(scene.volume.case)
     named = {given.label or name for name, given in scene.structures.items()}
-    checksum = ""
-    if (folder / LABELS).is_file():
-        with (folder / LABELS).open("rb") as stream:
-            checksum = hashlib.file_digest(stream, "sha256").hexdigest()
+    labels = folder / LABELS
     made_from = {
         "lower": list(mesh.lower or ()),
         "upper": list(mesh.upper or ()),
@@ -213,7 +210,7 @@ def _cache_key(scene: Scene) -> str:
         "structures": sorted(label for label in named if is_refined(scene, label)),
         "position": list(pose.position),
         "orientation": list(pose.orientation),
-        "labels": checksum,
+        "labels": hashlib.sha256(labels.read_bytes()).hexdigest() if labels.is_file() else "",
     }
     digest = hashlib.sha256(json.dumps([_GENERATOR, made_from]).encode()).hexdigest()
     return f"tissue-{digest[:16]}"

@@ -202,7 +202,6 @@ def _push_part(x, way, corners, gaps, mass, weight, box, r, p):  # noqa: PLR0913
     return 1
 
 
-CONTACT_TOLERANCE = 1e-9  # No vertex is deeper inside the collider than this, m
 # Fraction of the linear system's longest stable step that is used. Near 1, folded skin with
 # hardly any damping was seen to gain energy from frame to frame.
 _SAFETY = 0.7

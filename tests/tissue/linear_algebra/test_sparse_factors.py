@@ -11,7 +11,7 @@ from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, make_uniform_materials
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
 from us_sim.tissue.linear_algebra.sparse_factors import FactoredStiffness
-from us_sim.tissue.linear_algebra.two_level import CoarseGrid, TwoLevel, conjugate_gradients
+from us_sim.tissue.linear_algebra.two_level import CoarseGrid, TwoLevel, solve_conjugate_gradients
 
 NODES = (5, 4, 4)
 MESH = block_mesh(NODES)
@@ -97,7 +97,7 @@ def test_where_local_corrections_stall_it_takes_few_iterations():
     force = np.zeros((3, len(mesh.nodes)))
     force[2, model.movable_contact_nodes] = 1.0
     counts = [
-        conjugate_gradients(tissue.tangent_product, each, force.copy(), 400, 1e-4).iterations
+        solve_conjugate_gradients(tissue.tangent_product, each, force.copy(), 400, 1e-4).iterations
         for each in (local, factored)
     ]
     assert counts[1] < 40

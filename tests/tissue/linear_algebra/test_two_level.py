@@ -9,11 +9,7 @@ from hypothesis import strategies as st
 from tissue_block import block
 
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
-from us_sim.tissue.linear_algebra.two_level import (
-    CoarseGrid,
-    TwoLevel,
-    conjugate_gradients,
-)
+from us_sim.tissue.linear_algebra.two_level import CoarseGrid, TwoLevel, solve_conjugate_gradients
 
 MODEL = block((7, 5, 5))
 COUNT = len(MODEL.mesh.nodes)
@@ -95,7 +91,7 @@ def test_the_solution_is_that_of_a_dense_solve(coarse):
     made, *springs = two_level(coarse, SPRINGS)
     force = np.random.default_rng(0).normal(size=(3, COUNT))
     force[:, FIXED] = 0.0
-    solved = conjugate_gradients(
+    solved = solve_conjugate_gradients(
         tissue().tangent_product, made, force.copy(), 500, 1e-12, add_springs(*springs)
     )
     whole = with_springs(*springs)[np.ix_(MOVABLE, MOVABLE)]
@@ -116,7 +112,7 @@ def test_the_coarse_level_saves_iterations_with_and_without_springs():
         for springs in ([], firm):
             made, *given_springs = two_level(coarse, springs)
             add = add_springs(*given_springs)
-            solved = conjugate_gradients(
+            solved = solve_conjugate_gradients(
                 tissue().tangent_product, made, force.copy(), 500, 1e-6, add
             )
             counts.append(solved.iterations)
@@ -134,7 +130,7 @@ def test_negative_curvature_ends_it_with_what_came_before():
         tissue().tangent_product(field, image)
         image -= shift * field
 
-    solved = conjugate_gradients(indefinite, made, force.copy(), 500, 1e-12)
+    solved = solve_conjugate_gradients(indefinite, made, force.copy(), 500, 1e-12)
     assert solved.curved
     direction, image = solved.direction, np.empty_like(force)
     indefinite(direction, image)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from us_sim.geometry.pose import Pose
 from us_sim.tracking.camera.body_pose import (
+    CORNER_DEVIATION,
     PlaneAmbiguity,
     estimate_body_poses,
     rotation_angle,
@@ -84,16 +85,16 @@ def test_all_markers_are_solved_together():
 
 @pytest.mark.slow
 def test_the_covariance_is_that_of_the_errors():
-    # Mahalanobis lengths of errors have the mean of chi squared with 6 degrees: 6. Half a pixel
-    # of noise, as assumed.
+    # Mahalanobis lengths of errors have the mean of chi squared with 6 degrees: 6. The noise
+    # is as assumed.
     points, owners = corners_of(faceted_grip())
     random = np.random.default_rng(5)
     lengths = []
     for true in random_views(400, 0.4, (5.0, 40.0), seed=6):
         pixels = WEBCAM.project_points(true.transform_points(points)) + random.normal(
-            0, 0.5, (16, 2)
+            0, CORNER_DEVIATION, (16, 2)
         )
-        found = estimate_body_poses(WEBCAM, points, pixels, owners, deviation=0.5)[0]
+        found = estimate_body_poses(WEBCAM, points, pixels, owners)[0]
         turn = found.pose.rotation @ true.rotation.T
         error = np.empty(6)
         error[:3] = found.pose.position - true.position

@@ -35,18 +35,15 @@ if TYPE_CHECKING:
     from us_sim.volume.volume import Volume
 
 
-def run_rows_in_parallel(
-    threads: int, rows: int, work: Callable[[int, int], object], *, band: int = 1
-) -> None:
+def run_rows_in_parallel(threads: int, rows: int, work: Callable[[int, int], object]) -> None:
     """Do ``work(first_row, end_row)`` for all rows in parallel, one run of them a thread.
 
     Args:
         threads: how many, the caller's own among them.
         rows: how many.
         work: a kernel that does not hold the interpreter's lock.
-        band: rows that stay together: every run starts at a multiple of it.
     """
-    rows_each = band * -(-rows // (band * threads))
+    rows_each = -(-rows // threads)
     others = [
         _pool(threads - 1).submit(work, first, min(first + rows_each, rows))
         for first in range(rows_each, rows, rows_each)

@@ -83,7 +83,7 @@ def _precondition(preconditioner, residual, scaled):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def conjugate_gradients(  # noqa: PLR0913
+def run_conjugate_gradients(  # noqa: PLR0913
     start, columns, blocks, preconditioner, touched, normal, displacement, residual, direction,
     product, slope, norm, iterations, target,
 ):  # fmt: skip

@@ -28,6 +28,8 @@ from us_sim.kernels import njit
 from us_sim.tissue.elasticity.linear_tetrahedra import AveragedPressure
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
+_LARGEST_WHOLE = 60  # nodes of a part that is not halved
+
 
 @dataclass(eq=False)
 class DissectionPart:
@@ -38,26 +40,23 @@ class DissectionPart:
     boundary: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))  # above it
 
 
-def nested_dissection(
-    points: NDArray[np.float64], edges: NDArray[np.integer], largest: int = 60
-) -> DissectionPart:
+def nested_dissection(points: NDArray[np.float64], edges: NDArray[np.integer]) -> DissectionPart:
     """Dissect a mesh into the tree of its parts.
 
     Args:
         points: (N, 3) m, by whose coordinates nodes are halved.
         edges: (E, 2), which nodes couple.
-        largest: number of nodes up to which a part is not halved.
     """
     count = len(points)
     both = np.concatenate([edges, edges[:, ::-1]])
     graph = coo_array((np.ones(len(both), np.int8), tuple(both.T)), shape=(count, count)).tocsr()
-    root = _dissect(points, graph, np.arange(count), largest)
+    root = _dissect(points, graph, np.arange(count))
     _bound(root, graph, np.zeros(count, dtype=bool))
     return root
 
 
-def _dissect(points: NDArray, graph: csr_array, nodes: NDArray, largest: int) -> DissectionPart:
-    if len(nodes) <= largest:
+def _dissect(points: NDArray, graph: csr_array, nodes: NDArray) -> DissectionPart:
+    if len(nodes) <= _LARGEST_WHOLE:
         return DissectionPart(nodes)
     axis = int(np.argmax(np.ptp(points[nodes], axis=0)))
     along = points[nodes, axis]
@@ -77,7 +76,7 @@ def _dissect(points: NDArray, graph: csr_array, nodes: NDArray, largest: int) ->
     offset = np.arange(length.sum()) - np.repeat(np.cumsum(length) - length, length)
     separates[owner[inside[graph.indices[start[owner] + offset]]]] = True
     halves = [nodes[below], above[~separates]]
-    parts = [_dissect(points, graph, half, largest) for half in halves if len(half)]
+    parts = [_dissect(points, graph, half) for half in halves if len(half)]
     return DissectionPart(above[separates], parts)
 
 

@@ -327,7 +327,7 @@ _LOOP: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "
 
 @dataclass(frozen=True, eq=False)
 class CgSolution:
-    """Result of `conjugate_gradients`."""
+    """Result of `solve_conjugate_gradients`."""
 
     solution: NDArray[np.floating]  # (3, N)
     image: NDArray[np.floating]  # (3, N), the product without springs of the solution
@@ -401,7 +401,7 @@ class TwoLevel:
             self._grid.add_correction(residual, out)
 
 
-def conjugate_gradients(
+def solve_conjugate_gradients(
     product: Product,
     preconditioner: Preconditioner,
     residual: NDArray[np.floating],

@@ -34,7 +34,7 @@ from us_sim.tissue.elasticity.linear_tetrahedra import (
     require_held,
 )
 from us_sim.tissue.elasticity.stability import count_inverted, select_watched_tetrahedra
-from us_sim.tissue.linear_algebra.conjugate_gradients import conjugate_gradients, product_rows
+from us_sim.tissue.linear_algebra.conjugate_gradients import product_rows, run_conjugate_gradients
 from us_sim.tissue.model import Deformation, TissueModel, TissueState
 from us_sim.tissue.solvers.solver import COUNT, TOLERANCE, SolverSettings, TissueSolver
 
@@ -161,7 +161,7 @@ class FemCg(TissueSolver):
                 displacement[self._touchable] = surface
                 self._renew_equations()
             anew = self._slope < 0.0
-            self._slope, before, self._norm = conjugate_gradients(
+            self._slope, before, self._norm = run_conjugate_gradients(
                 *self._matrix,
                 self._preconditioner,
                 self._touched,

@@ -39,8 +39,8 @@ from us_sim.tissue.linear_algebra.two_level import (
     TwoLevel,
     add_blocks,
     clear_nodes,
-    conjugate_gradients,
     largest_local_eigenvalue,
+    solve_conjugate_gradients,
 )
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.tuning import TUNING
@@ -336,7 +336,7 @@ class Newton:
             springs = points.nodes[active], points.weights[active], directions, stiffness
             lumped = points.lump_springs(active, directions, stiffness)
             self._conditioner = self._preconditioner(blocks, *lumped)
-            solved = conjugate_gradients(
+            solved = solve_conjugate_gradients(
                 tangent_product,
                 self._conditioner,
                 (residual / norm).astype(self._dtype),

@@ -155,7 +155,6 @@ def estimate_body_poses(
     owners: NDArray[np.int64] | None = None,
     *,
     guess: Pose | None = None,
-    deviation: float = CORNER_DEVIATION,
 ) -> list[BodyPose]:
     """Estimate the pose of a body of which points are seen, and the other that a plane may have.
 
@@ -169,7 +168,6 @@ def estimate_body_poses(
         pixels: (N, 2), where the image has them.
         owners: (N,) the marker that each point is of; default: all are of one plane.
         guess: of the pose, for instance from the last image.
-        deviation: pixels, the least standard deviation of a coordinate.
 
     Returns:
         At most two, that of the least error first; none where no pose has all points before the
@@ -187,14 +185,14 @@ def estimate_body_poses(
         return []
     places = np.concatenate([points @ turn.T + place for turn, place in guesses])
     offsets = camera.project_points(places).reshape(-1, len(points), 2) - pixels
-    misfits = [_misfit(_lengths(each, deviation)) for each in offsets]
+    misfits = [_misfit(_lengths(each)) for each in offsets]
     found: list[BodyPose] = []
     for i in np.argsort(misfits, kind="stable")[: _REFINED + 1].tolist():
         if not np.isfinite(misfits[i]):
             break
         turn, place = guesses[i]
         known = [each.pose.rotation for each in found]
-        pose = _refine_pose(camera, points, pixels, turn, place, deviation, known)
+        pose = _refine_pose(camera, points, pixels, turn, place, known)
         if pose is not None:
             found.append(pose)
     return sorted(found, key=lambda each: each.misfit)[:2]
@@ -226,9 +224,9 @@ def _guesses(
     ]
 
 
-def _lengths(residuals: NDArray[np.float64], deviation: float) -> NDArray[np.float64]:
+def _lengths(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the lengths (N,) of residuals (N, 2), in deviations."""
-    return np.asarray(np.sqrt(np.einsum("ij,ij->i", residuals, residuals)) / deviation)
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", residuals, residuals)) / CORNER_DEVIATION)
 
 
 def _misfit(lengths: NDArray[np.float64]) -> float:
@@ -244,7 +242,6 @@ def _refine_pose(
     pixels: NDArray[np.float64],
     rotation: NDArray[np.float64],
     position: NDArray[np.float64],
-    deviation: float,
     known: list[NDArray[np.float64]],
 ) -> BodyPose | None:
     """Descend to the pose of least misfit: Levenberg-Marquardt on SE(3) with Huber's weights.
@@ -262,14 +259,14 @@ def _refine_pose(
             return None
         seen, slopes = camera.linearise_projection(points @ rotation.T, position)
         offsets = seen - pixels
-        lengths = _lengths(offsets, deviation)
+        lengths = _lengths(offsets)
         loss = _misfit(lengths)
         if loss < misfit:
             gain, misfit, damping = misfit - loss, loss, max(damping * 0.1, 1e-9)
             matrix, residuals = np.eye(4), offsets
             matrix[:3, :3], matrix[:3, 3] = rotation, position
             weights = np.minimum(1.0, _HUBER / np.maximum(lengths, 1e-12))
-            weighted = slopes.T * np.repeat(weights / deviation**2, 2)
+            weighted = slopes.T * np.repeat(weights / CORNER_DEVIATION**2, 2)
             normal, gradient = weighted @ slopes, weighted @ residuals.ravel()
             if gain <= _STEADY * misfit + 1e-12:
                 break
@@ -287,13 +284,14 @@ def _refine_pose(
         return None
     squares = float((residuals**2).sum())
     freedom = max(1, residuals.size - 6)
-    noise = max(deviation, float(np.sqrt(min(squares, misfit * deviation**2) / freedom)))
+    left = min(squares, misfit * CORNER_DEVIATION**2)
+    noise = max(CORNER_DEVIATION, float(np.sqrt(left / freedom)))
     scale = 1.0 / np.sqrt(np.diag(normal))
     values, vectors = np.linalg.eigh(normal * np.outer(scale, scale))
     if not values[0] > _DETERMINED:
         return None
     half = scale[:, None] * vectors / np.sqrt(values)
-    covariance = half @ half.T * (noise / deviation) ** 2
+    covariance = half @ half.T * (noise / CORNER_DEVIATION) ** 2
     return BodyPose(
         Pose.from_matrix(matrix),
         0.5 * (covariance + covariance.T),
