@@ -290,6 +290,14 @@ class Subscriptions:
         return True
 
 
+def keep_newest(values: dict[Any, Any], key: Any, value: Any, most: int) -> None:
+    """Keep a value as the newest; drop the oldest beyond ``most``."""
+    values.pop(key, None)
+    values[key] = value
+    if len(values) > most:
+        del values[next(iter(values))]
+
+
 def error_kind(error: UsSimError) -> str:
     """Return the kind by which an error is counted: ``pose`` for a PoseError."""
     return type(error).__name__.removesuffix("Error").lower()

@@ -12,7 +12,7 @@ import numpy as np
 from sensor_msgs.msg import Image
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.guarded_node import GuardedNode, keep_newest
 from us_sim.nodes.parameters import declare_settings
 from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import EVERY
@@ -58,10 +58,8 @@ class ImageWriter(GuardedNode):
     def _number(self, stamp: int) -> int:
         """Return the number of a stamp: the next number if nothing with it has come yet."""
         if stamp not in self._numbers:
-            self._numbers[stamp] = self._next
+            keep_newest(self._numbers, stamp, self._next, REMEMBERED)
             self._next += 1
-            if len(self._numbers) > REMEMBERED:
-                del self._numbers[next(iter(self._numbers))]
         return self._numbers[stamp]
 
 

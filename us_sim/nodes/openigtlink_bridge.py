@@ -11,6 +11,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Float64MultiArray
 
 from us_sim.errors import ProbeError
+from us_sim.nodes.guarded_node import keep_newest
 from us_sim.nodes.parameters import declare_settings
 from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import LATCHED
@@ -79,9 +80,7 @@ class OpenIGTLinkBridge(SceneNode):
         pose = pose_from(message, "patient")
         stamp = nanoseconds_of(message.header.stamp)
         matrix = self._from_patient @ pose.matrix
-        self._poses[stamp] = matrix
-        while len(self._poses) > REMEMBERED:
-            del self._poses[next(iter(self._poses))]
+        keep_newest(self._poses, stamp, matrix, REMEMBERED)
         self._send_transform("ProbeToReference", stamp, matrix)
         if self._image is not None:
             self._on_image(self._image)

@@ -21,7 +21,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from us_sim import __version__
 from us_sim.errors import ScoreError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.guarded_node import status_message
+from us_sim.nodes.guarded_node import keep_newest, status_message
 from us_sim.nodes.parameters import LiveSettings, declare_settings
 from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import EVERY
@@ -107,9 +107,7 @@ class Scorer(SceneNode):
         stamp, pose = nanoseconds_of(message.header.stamp), pose_from(message, "patient")
         self._begin = self._begin or stamp
         self._live.add_pose(self._seconds(stamp), pose)
-        self._poses[stamp] = pose
-        if len(self._poses) > _REMEMBERED:
-            del self._poses[next(iter(self._poses))]
+        keep_newest(self._poses, stamp, pose, _REMEMBERED)
 
     def _on_wrench(self, message: WrenchStamped) -> None:
         if self._begin:

@@ -13,6 +13,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 
 from us_sim.geometry.pose import Pose
+from us_sim.nodes.guarded_node import keep_newest
 from us_sim.nodes.messages import affine_message
 from us_sim.nodes.parameters import LiveSettings
 from us_sim.nodes.process import node_main
@@ -133,7 +134,8 @@ class SliceInterpolator(SceneNode):
             self._has_mesh = True
 
     def _on_pose(self, message: PoseStamped) -> None:
-        _remember(self._poses, message, self._pose(message), REMEMBERED)
+        pose = self._pose(message)
+        keep_newest(self._poses, nanoseconds_of(message.header.stamp), pose, REMEMBERED)
         self._image_unpaired()
 
     def _on_skin(self, message: PointCloud2) -> None:
@@ -145,7 +147,8 @@ class SliceInterpolator(SceneNode):
                 f"contact is with the tissue; start both with the same scene",
             )
         elif self._skins is not None:
-            _remember(self._skins, message, vertices, SKINS_REMEMBERED)
+            stamp = nanoseconds_of(message.header.stamp)
+            keep_newest(self._skins, stamp, vertices, SKINS_REMEMBERED)
             if self.lockstep:
                 self._image_unpaired()
 
@@ -228,14 +231,6 @@ def _contact(frame: Frame) -> dict[str, str]:
     coupling = float(frame.contact[0].mean())
     word = "none" if coupling < _NONE else "poor" if coupling < _POOR else "good"
     return {"contact": word, "coupling": f"{coupling:.2f}"}
-
-
-def _remember(
-    values: dict[int, Any], message: PoseStamped | PointCloud2, value: Any, most: int
-) -> None:
-    values[nanoseconds_of(message.header.stamp)] = value
-    while len(values) > most:
-        del values[next(iter(values))]
 
 
 main = node_main(SliceInterpolator, __name__)

@@ -24,7 +24,7 @@ from std_msgs.msg import Float64MultiArray, Int32MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from us_sim.errors import MeshError, VolumeError
-from us_sim.nodes.guarded_node import GuardedNode, Subscriptions
+from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, keep_newest
 from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.recording.decoding import (
     affine_from,
@@ -246,13 +246,13 @@ class ProbeFeeds:
     def _on_pose(self, message: PoseStamped) -> None:
         pose = pose_from(message, "patient")
         place = {"position": pose.position.tolist(), "quaternion": pose.orientation.tolist()}
-        _keep(self._poses, _format_stamp(message), place, _UNIMAGED)
+        keep_newest(self._poses, _format_stamp(message), place, _UNIMAGED)
         self._offer()
 
     def _on_wrench(self, message: WrenchStamped) -> None:
         wrench = wrench_from(message, "probe").tolist()
         forces = {"force": wrench[:3], "torque": wrench[3:]}
-        _keep(self._forces, _format_stamp(message), forces, _UNIMAGED)
+        keep_newest(self._forces, _format_stamp(message), forces, _UNIMAGED)
         self._offer()
 
     def _offer(self) -> None:
@@ -265,14 +265,6 @@ class ProbeFeeds:
             age = round(1e-9 * (int(stamp) - int(force_stamp)), 3)
             header |= force | {"force_stamp": force_stamp, "force_age": age}
         self._feed.offer_packet(lambda sequence: Packet("probe", sequence, header, b""))
-
-
-def _keep(values: dict[Any, Any], key: Any, value: Any, most: int) -> None:
-    """Keep a value as the newest; drop the oldest beyond ``most``."""
-    values.pop(key, None)
-    values[key] = value
-    if len(values) > most:
-        del values[next(iter(values))]
 
 
 def _make_probe_mesh(message: MarkerArray, sequence: int) -> Packet:
@@ -464,7 +456,7 @@ class StructuresFeed:
             self._node, PointCloud2, _NODES, data, lambda m: nanoseconds_of(m.header.stamp)
         )
         if stamp is not None:
-            _keep(self._nodes, stamp, data, _UNPAIRED)
+            keep_newest(self._nodes, stamp, data, _UNPAIRED)
             self._start_making()
 
     def _on_structures(self, data: bytes) -> None:

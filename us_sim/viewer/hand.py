@@ -17,7 +17,7 @@ from shape_msgs.msg import Mesh
 
 from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.guarded_node import GuardedNode, Subscriptions
+from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, keep_newest
 from us_sim.nodes.messages import pose_message
 from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.nodes.scene_node import LEAD_TOPIC
@@ -414,9 +414,7 @@ class ViewerHand:
         stance = self._motion.stance
         pose = stance.compute_pose(self._standing)
         # Kept before it is published, as its image may come at once.
-        self._published[stamp.nanoseconds] = stance.press, self._last
-        if len(self._published) > _KEPT:
-            del self._published[next(iter(self._published))]
+        keep_newest(self._published, stamp.nanoseconds, (stance.press, self._last), _KEPT)
         self._publisher.publish(pose_message(pose, stamp.to_msg(), PATIENT))
         self._sent_at = time.monotonic()
         self._node.health.count_published(LEAD_TOPIC)
