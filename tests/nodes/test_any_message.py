@@ -27,9 +27,9 @@ from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes import messages
 from us_sim.nodes.image_writer import ImageWriter
+from us_sim.nodes.messages import TFMessage
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.slice_interpolator import SliceInterpolator
-from us_sim.nodes.tf import TFMessage
 from us_sim.nodes.tracker_inputs.camera_input import camera_model_from
 from us_sim.recording import decoding
 from us_sim.scene.building import build_tissue_model, load_volume

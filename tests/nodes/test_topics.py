@@ -13,6 +13,7 @@ from us_sim import viewer
 from us_sim.nodes.camera_driver import CameraDriver
 from us_sim.nodes.haptic_renderer import HapticRenderer
 from us_sim.nodes.image_writer import ImageWriter
+from us_sim.nodes.messages import TFMessage
 from us_sim.nodes.openigtlink_bridge import OpenIGTLinkBridge
 from us_sim.nodes.path_player import PathPlayer
 from us_sim.nodes.probe_robot import ProbeRobot
@@ -24,7 +25,6 @@ from us_sim.nodes.settings import NODES
 from us_sim.nodes.skin_deformer import SkinDeformer
 from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.nodes.space_mouse_driver import SpaceMouseDriver
-from us_sim.nodes.tf import TFMessage
 from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.nodes.topics import TOPICS
 from us_sim.settings.registry import TRACKERS

@@ -14,8 +14,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Joy
 
 from us_sim.errors import SceneError, TrackingError, UsSimError
 from us_sim.geometry.pose import Pose
+from us_sim.nodes.messages import TFMessage
 from us_sim.nodes.probe_tracker import ProbeTracker
-from us_sim.nodes.tf import TFMessage
 from us_sim.tracking.camera.encodings import decompress_image
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rendered_views import SHARP, RenderedView

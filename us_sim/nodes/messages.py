@@ -5,6 +5,7 @@ rclpy takes bulk data in ``array.array`` without a look at each element.
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from array import array
 from collections.abc import Sequence
@@ -25,6 +26,13 @@ from us_sim.recording.decoding import LAST_SECOND, SECOND, to_nanoseconds
 from us_sim.tracking.haptic import ContactModel
 
 CDR_LITTLE_ENDIAN = b"\0\1\0\0"  # what serialized messages begin with
+TFMessage: Any = None
+"""The class of tf2_msgs; None where it is not installed: every ROS 2 has it, PyPI has not."""
+
+with contextlib.suppress(ModuleNotFoundError):
+    import tf2_msgs.msg
+
+    TFMessage = tf2_msgs.msg.TFMessage
 
 
 def pack_array(code: str, values: NDArray[Any]) -> array[Any]:
@@ -84,7 +92,7 @@ def wrench_message(
 def serialize_wrench(wrench: NDArray[np.float64], stamp: int, frame: str) -> bytes:
     """Serialize a WrenchStamped of force and torque (6,) N, N m at ns; ten times rclpy's speed."""
     name = frame.encode() + b"\0"
-    head = struct.pack(f"@iII{len(name)}s0d", *divmod(stamp, 1_000_000_000), len(name), name)
+    head = struct.pack(f"@iII{len(name)}s0d", *divmod(stamp, SECOND), len(name), name)
     return CDR_LITTLE_ENDIAN + head + wrench.astype("<f8").tobytes()
 
 

@@ -14,6 +14,7 @@ from us_sim.geometry.transducer import build_transducer_mesh
 from us_sim.nodes.guarded_node import status_message
 from us_sim.nodes.messages import (
     MarkerShape,
+    TFMessage,
     pose_message,
     pose_text,
     serialize_markers,
@@ -24,7 +25,6 @@ from us_sim.nodes.parameters import LiveSettings
 from us_sim.nodes.process import node_main
 from us_sim.nodes.scene_node import explain_missing_poses
 from us_sim.nodes.settings import ProbeTrackerSettings
-from us_sim.nodes.tf import TFMessage
 from us_sim.nodes.tracker_inputs.device import TrackerInput, TrackerNode
 from us_sim.scene.building import (
     build_collider,

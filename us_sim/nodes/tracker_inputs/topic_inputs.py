@@ -13,8 +13,8 @@ from std_msgs.msg import Bool, Header
 from us_sim.errors import PoseError, SceneError, TrackingError
 from us_sim.geometry.frame_chain import FrameChain
 from us_sim.geometry.pose import Pose
+from us_sim.nodes.messages import TFMessage
 from us_sim.nodes.qos import FOREIGN
-from us_sim.nodes.tf import TFMessage
 from us_sim.nodes.tracker_inputs.device import TrackerInput, TrackerNode
 from us_sim.recording.decoding import transform_from
 from us_sim.settings.spelling import format_count
