@@ -18,12 +18,13 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from us_sim.errors import UsSimError, printable_line
 from us_sim.nodes import explain_ros_error
-from us_sim.nodes.qos import EVERY, LATCHED, SENT, STREAM, qos_override_options
+from us_sim.nodes.qos import EVERY, LATCHED, SENT, STREAM
 from us_sim.recording.decoding import nanoseconds_of
 
 T = TypeVar("T")
@@ -111,7 +112,7 @@ class GuardedNode(Node):
         subscription: Subscription = self.create_subscription(
             *(message_type, topic, self.guard_callback(where, on_message), qos),
             raw=raw,
-            qos_overriding_options=qos_override_options(),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
         return subscription
 
@@ -171,9 +172,8 @@ class GuardedNode(Node):
         self, message_type: Any, topic: str, qos: QoSProfile = SENT
     ) -> Publisher:
         """Create a publisher whose quality of service may be overridden by parameters."""
-        return self.create_publisher(
-            message_type, topic, qos, qos_overriding_options=qos_override_options()
-        )
+        overrides = QoSOverridingOptions.with_default_policies()
+        return self.create_publisher(message_type, topic, qos, qos_overriding_options=overrides)
 
     def create_latched_publisher(self, message_type: Any, topic: str) -> Publisher:
         """Create a publisher of messages that are kept for later subscribers."""

@@ -1,7 +1,6 @@
 """The quality of service of each kind of topic in the graph."""
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
 
 STREAM = QoSProfile(depth=10)  # reliable, volatile, keep last, as rclpy's is where nothing is said
 """Poses, nodes and images inside the graph, for subscribers that want the newest."""
@@ -19,8 +18,3 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 FOREIGN = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Input from drivers, many of which publish best effort. A tracker's filter wants every pose, so
 some may wait while the process does not get a processor."""
-
-
-def qos_override_options() -> QoSOverridingOptions:
-    """Have history, depth and reliability of a topic as parameters ``qos_overrides.…``."""
-    return QoSOverridingOptions.with_default_policies()

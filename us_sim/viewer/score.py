@@ -13,7 +13,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from us_sim.nodes.guarded_node import GuardedNode, loggable_text
-from us_sim.nodes.qos import LATCHED, STREAM, qos_override_options
+from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.nodes.topics import FROZEN
 from us_sim.recording import MARKER
 from us_sim.scoring.settings import STATES
@@ -27,9 +27,7 @@ _STATES = {DiagnosticStatus.OK: "done", DiagnosticStatus.ERROR: "missed"}
 
 def connect_scorer(node: GuardedNode, post: CallPoster, simulator: Simulator) -> None:
     """Add the score's feeds, requests to `scorer`, and marks of frozen images to the simulator."""
-    marks = node.create_publisher(
-        String, MARKER, STREAM, qos_overriding_options=qos_override_options()
-    )
+    marks = node.create_stream_publisher(String, MARKER, STREAM)
     services = {name: node.create_client(Trigger, f"scorer/{name}") for name in ("clear", "draw")}
 
     def ask(what: str) -> None:
