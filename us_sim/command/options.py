@@ -20,15 +20,13 @@ import argparse
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
+from typing import Any, TypeVar, get_args, get_origin
 
 from us_sim.errors import UsSimError
 from us_sim.settings.setting import Settings, kinds_of, rules_of
 from us_sim.settings.spelling import describe_unknown
+from us_sim.settings.viewer import ViewerSettings
 from us_sim.share import find_bag
-
-if TYPE_CHECKING:
-    from us_sim.settings.viewer import ViewerSettings
 
 
 class ChosenParser(argparse.ArgumentParser):
@@ -208,8 +206,6 @@ def add_running_options(parser: argparse.ArgumentParser, default: str = "") -> N
 
 def add_viewer_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the viewer's server."""
-    from us_sim.settings.viewer import ViewerSettings
-
     add_setting_options(parser, ViewerSettings, _OF_THE_VIEWER)
 
 
@@ -221,8 +217,6 @@ def add_view_option(parser: argparse.ArgumentParser) -> None:
 
 def read_viewer_settings(args: argparse.Namespace) -> ViewerSettings:
     """Read the settings of the viewer; raise UsSimError for a wrong value."""
-    from us_sim.settings.viewer import ViewerSettings
-
     return read_settings(args, ViewerSettings, _OF_THE_VIEWER)
 
 
