@@ -25,7 +25,7 @@ class FakeNodes(RemoteParameters):
     @property
     def watched(self) -> set[str]:
         """The nodes that pages show."""
-        return {name for name, node in self._nodes.items() if node.pages}
+        return {name for name, node in self._nodes.items() if node.is_watched}
 
     def _make(self, name: str) -> NodeParameters:
         return FakeNode(name, self._take)

@@ -148,10 +148,10 @@ def test_lists_are_numbers_in_the_unit_that_is_shown():
 class Pages:
     """An event loop that serves pages, beside the bench's thread, and the nodes that they show."""
 
-    def __init__(self, bench: Bench, **doors: Any) -> None:
+    def __init__(self, bench: Bench, **setters: Any) -> None:
         self._bench = bench
         self.nodes = RemoteParameters(
-            bench.add(GuardedNode("asking", context=bench.context)), doors
+            bench.add(GuardedNode("asking", context=bench.context)), setters
         )
         self.loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self.loop.run_forever)
@@ -367,17 +367,17 @@ def test_nothing_is_asked_while_nobody_looks(bench, pages):
     assert "gain" in pages.look_at("console").parameters  # read anew when somebody does again
 
 
-def test_a_node_with_a_door_is_set_through_that_alone(bench):
+def test_a_node_with_a_setter_is_set_by_that_alone(bench):
     asked: list[dict[str, Any]] = []
     refused: Future[str] = Future()
     refused.set_result("not from here")
 
-    def door(**values: Any) -> "Future[str]":
+    def ask(**values: Any) -> "Future[str]":
         asked.append(values)
         return refused
 
     node = console(bench)
-    with contextlib.closing(Pages(bench, console=door)) as pages:
+    with contextlib.closing(Pages(bench, console=ask)) as pages:
         pages.look_at("console")
         assert pages.set("console", "gain", 3.0) == "not from here"
     assert asked == [{"gain": 3.0}]

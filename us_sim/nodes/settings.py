@@ -446,7 +446,7 @@ NODES: dict[str, tuple[type[Settings], ...]] = {
 }
 """Settings that are parameters of a node; `parameters_of` adds those of parts of its scene."""
 
-_ROS_OWN = ("use_sim_time", "qos_overrides.", "start_type_description_service")
+RCLPY_PARAMETERS = ("use_sim_time", "qos_overrides.", "start_type_description_service")
 """Parameters that rclpy itself declares, or prefixes of them."""
 
 
@@ -513,7 +513,7 @@ def _checked(
     node: str, name: str, text: str, known: Mapping[str, tuple[type[Settings], str]]
 ) -> object:
     option = f"--param {node}.{name}"
-    if name not in known and not name.startswith(_ROS_OWN):
+    if name not in known and not name.startswith(RCLPY_PARAMETERS):
         raise UsSimError(
             f"{option}: {describe_unknown(name, known)} (`us-sim reference {node}` says more)"
         )

@@ -25,7 +25,6 @@ from us_sim.viewer.panels.exercise import ExercisePanel
 from us_sim.viewer.panels.nodes import TISSUE, build_image, build_status, build_tissue
 from us_sim.viewer.panels.session import CasesPanel, SessionPanel
 from us_sim.viewer.parameters import ParameterKind
-from us_sim.viewer.remote_parameters import NodeParameters
 from us_sim.viewer.score import get_score, is_blind
 from us_sim.viewer.session import SessionState
 from us_sim.viewer.status import PageCounter
@@ -263,7 +262,7 @@ def build_headline(simulator: Simulator) -> None:
     ui.timer(0.5, refresh)
 
 
-def _watch_while_connected(*shown: PageCounter | NodeParameters) -> None:
+def _watch_while_connected(*shown: PageCounter) -> None:
     """Count the page while its browser is connected; a browser may come and go several times."""
     connections = 0
 

@@ -20,13 +20,13 @@ from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 
 from us_sim.errors import SettingsError
+from us_sim.nodes.settings import RCLPY_PARAMETERS
 from us_sim.settings.quantity import units_of
 from us_sim.viewer.parameters import Parameter, ParameterKind
+from us_sim.viewer.status import PageCounter
 
 ANSWER_S = 10.0  # for an answer: a node that makes images anew may need seconds
 LOOK_S = 0.5  # between two looks for nodes that have come, gone, or started again
-_OF_ROS = ("use_sim_time", "qos_overrides.", "start_type_description_service")
-"""Parameters, or prefixes of them, that rclpy itself declares; a page leaves them out."""
 
 ABSENT = "is not running"
 ASKED = "is being asked for its parameters"
@@ -65,11 +65,11 @@ async def await_answer(answer: Future[str], name: str) -> str:
         return f"{name} did not answer within {ANSWER_S:g} s"
 
 
-Door = Callable[..., "Future[str]"]
+ParameterSetter = Callable[..., "Future[str]"]
 """Sets parameters, given by name; the future holds the refusal, or ""."""
 
 
-class NodeParameters:
+class NodeParameters(PageCounter):
     """The parameters of another node, up to date while pages show them.
 
     The publisher of its parameter events has another number after a restart of the node. Any thread
@@ -79,30 +79,28 @@ class NodeParameters:
     Args:
         name: of the node, within the namespace.
         client: asks the node; None asks nothing.
-        door: sets parameters in place of the client.
+        setter: sets parameters in place of the client.
     """
 
     def __init__(
-        self, name: str, client: AsyncParameterClient | None = None, door: Door | None = None
+        self,
+        name: str,
+        client: AsyncParameterClient | None = None,
+        setter: ParameterSetter | None = None,
     ) -> None:
+        super().__init__(self._on_pages)
         self.name = name
         self.state = ABSENT
         self.parameters: Mapping[str, Parameter] = {}  # by name; another object after each change
-        self.pages = 0  # that show them
-        self._client, self._door = client, door
+        self._client, self._setter = client, setter
         self._following: asyncio.Task[None] | None = None
         self._is_old = asyncio.Event()  # the parameters must be read anew
 
-    def add_page(self) -> None:
-        """Count a page that shows the parameters; with the first, begin to follow them."""
-        self.pages += 1
-        if self.pages == 1 and self._client is not None:
+    def _on_pages(self) -> None:
+        """Follow the parameters from the first page that shows them to the last."""
+        if self.is_watched and self._client is not None:
             self._following = asyncio.ensure_future(self._follow(self._client))
-
-    def remove_page(self) -> None:
-        """Count a page less; with the last, stop following the parameters."""
-        self.pages -= 1
-        if not self.pages and self._following is not None:
+        elif self._following is not None:
             self._following.cancel()
 
     async def set_value(self, name: str, value: Any) -> str:
@@ -122,8 +120,8 @@ class NodeParameters:
 
     async def _send(self, parameter: Parameter, raw: Any) -> str:
         name = parameter.name
-        if self._door is not None:
-            return await await_answer(self._door(**{name: raw}), self.name)
+        if self._setter is not None:
+            return await await_answer(self._setter(**{name: raw}), self.name)
         assert self._client is not None  # it has read the parameter
         answer = set_atomically(self._client, [RosParameter(name, parameter.kind.value, raw)])
         refusal = await await_answer(answer, self.name)
@@ -169,7 +167,7 @@ class NodeParameters:
                 while not client.services_are_ready():
                     await asyncio.sleep(0.1 * LOOK_S)
                 listed = (await _await_result(client.list_parameters())).result.names
-                names = [name for name in listed if not name.startswith(_OF_ROS)]
+                names = [name for name in listed if not name.startswith(RCLPY_PARAMETERS)]
                 types = (await _await_result(client.get_parameter_types(names))).types
                 # For a parameter without a value rclpy answers with no values at all.
                 names = [name for name, type_ in zip(names, types, strict=False) if type_]
@@ -196,7 +194,7 @@ class NodeParameters:
             kind, raw = _read_value(message.value)
             if known is not None and known.kind is kind:
                 self.parameters = {**self.parameters, message.name: known.with_raw(raw)}
-            elif not message.name.startswith(_OF_ROS):
+            elif not message.name.startswith(RCLPY_PARAMETERS):
                 self._is_old.set()
 
 
@@ -205,11 +203,13 @@ class RemoteParameters:
 
     Args:
         node: the node whose clients ask; None asks nothing.
-        doors: by a node's name, a function that sets parameters in place of its client.
+        setters: by a node's name, a function that sets parameters in place of its client.
     """
 
-    def __init__(self, node: Node | None = None, doors: Mapping[str, Door] | None = None) -> None:
-        self._node, self._doors = node, doors or {}
+    def __init__(
+        self, node: Node | None = None, setters: Mapping[str, ParameterSetter] | None = None
+    ) -> None:
+        self._node, self._setters = node, setters or {}
         self._nodes: dict[str, NodeParameters] = {}
 
     def get_node(self, name: str) -> NodeParameters:
@@ -222,7 +222,7 @@ class RemoteParameters:
             return NodeParameters(name)
         space = self._node.get_namespace().rstrip("/")
         client = AsyncParameterClient(self._node, f"{space}/{name}")
-        return NodeParameters(name, client, self._doors.get(name))
+        return NodeParameters(name, client, self._setters.get(name))
 
 
 async def _await_result(request: Any) -> Any:
