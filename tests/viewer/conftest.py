@@ -66,7 +66,7 @@ def tabs(profile: Any, served: Any) -> Callable[[], tuple[Any, list[str]]]:
             tabs[-1][0].close()
         if not tabs or tabs[-1][0].is_closed():
             page, wrong = profile.new_page(), list[str]()
-            page.address = served[0].address
+            page.address = served[0].addresses[0]
             page.route(
                 f"{page.address}/empty",
                 lambda route: route.fulfill(body=EMPTY, content_type="text/html"),

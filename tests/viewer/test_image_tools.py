@@ -63,7 +63,7 @@ def test_nothing_is_drawn_or_measured_before_the_first_image(
 ) -> None:
     simulator.feeds["image"] = Feed("image", rate=None)
     page = browser.new_page(viewport={"width": 1280, "height": 720})
-    page.goto(served[0].address)
+    page.goto(served[0].addresses[0])
     page.get_by_text("Waiting for the first image").wait_for()
     page.set_viewport_size({"width": 1100, "height": 720})  # which has the scale drawn
     page.wait_for_function("document.querySelector('.us-scale').width > 300")

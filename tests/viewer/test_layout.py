@@ -62,8 +62,8 @@ def opened(browser: Any, served: Any, hand: FakeHand) -> Iterator[Open]:  # noqa
         viewport = {"width": width, "height": height}
         contexts.append(browser.new_context(viewport=viewport, has_touch=touch, is_mobile=touch))
         page = contexts[-1].new_page()
-        watched(page, served[0].address, wrong)
-        page.goto(served[0].address)
+        watched(page, served[0].addresses[0], wrong)
+        page.goto(served[0].addresses[0])
         page.wait_for_function("document.querySelector('.us-image')?.width === 320")
         page.wait_for_function("document.querySelector('.us-quantity input')?.disabled === false")
         page.wait_for_selector(".us-tools-views")

@@ -97,10 +97,10 @@ def test_a_page_of_another_origin_gets_no_stream(browser: Any, served: Any) -> N
 
 def test_no_other_page_can_frame_it_and_no_markup_runs_script(browser: Any, served: Any) -> None:
     page = browser.new_page()
-    page.set_content(f'<iframe src="{served[0].address}"></iframe>')
+    page.set_content(f'<iframe src="{served[0].addresses[0]}"></iframe>')
     frame = until(lambda: page.frames[1:] and page.frames[1], "there is a frame")
     until(lambda: frame.url.startswith("chrome-error:"), "the browser refuses to fill it")
-    page.goto(served[0].address)
+    page.goto(served[0].addresses[0])
     said: list[str] = []
     page.on("console", lambda message: said.append(message.text))
     page.evaluate("document.body.insertAdjacentHTML('beforeend', '<b onclick=\"XSS = 1\">b</b>')")
@@ -115,7 +115,7 @@ def test_a_path_that_is_not_there_leaves_nothing_in_the_log(
     served: Any, caplog: Any, path: str
 ) -> None:
     with pytest.raises(urllib.error.HTTPError) as refused:
-        urllib.request.urlopen(served[0].address + path[1:])
+        urllib.request.urlopen(served[0].addresses[0] + path[1:])
     assert refused.value.code == 404
     assert not caplog.records
 

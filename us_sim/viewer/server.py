@@ -93,11 +93,6 @@ class WebServer:
         self._await_start()
 
     @property
-    def address(self) -> str:
-        """The URL for a person to open."""
-        return self.addresses[0]
-
-    @property
     def addresses(self) -> tuple[str, ...]:
         """All URLs for a person to open.
 
