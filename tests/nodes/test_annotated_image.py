@@ -192,7 +192,7 @@ def test_colours_that_cannot_be_made_are_said_and_the_image_is_shown(bench, show
     pictures = subscribed(bench, node)
     node.annotated.publish_frame(Shown(GREY_IMAGE), node.stamp())
     bench.spin_until(lambda: pictures)
-    assert node.health.problem_count("overlay") == 1
+    assert node.health.problems["overlay"] == 1
     assert picture(pictures[0])[90, 100].tolist() == [90, 90, 90]
 
 
@@ -220,12 +220,12 @@ def test_without_new_poses_the_last_image_is_frozen_marked_and_keeps_its_stamp(b
 def test_diagnostics_say_once_that_poses_stay_away_and_that_they_are_back(bench, show):
     node = show(stale_after=1.0, lost_after=1.5)  # looked at five times a second
     bench.spin_until(lambda: node.health.values.get("probe_pose") == "waiting")
-    assert node.health.problem_count("pose age") == 0
+    assert node.health.problems["pose age"] == 0
     for times in (1, 2):
         node.annotated.on_usable_pose()
         bench.spin_until(lambda: node.health.values["probe_pose"] == "live")
         bench.spin_until(lambda: node.health.values["probe_pose"] == "lost")
-        assert node.health.problem_count("pose age") == times
+        assert node.health.problems["pose age"] == times
 
 
 @pytest.mark.parametrize("age", [95_332_936.7, -3600.0])  # a path of years ago, a clock ahead

@@ -124,15 +124,15 @@ def test_a_camera_that_comes_and_goes_is_waited_for(bench, monkeypatch, calibrat
     node = bench.make(CameraDriver, source=7, camera_info=str(calibration))
     images = bench.collect(Image, "camera/image_raw")
     reports = bench.collect(DiagnosticArray, "diagnostics")
-    bench.spin_until(lambda: node.health.problem_count("camera") > 1)
+    bench.spin_until(lambda: node.health.problems["camera"] > 1)
     for _ in range(2):
         images.clear()
-        problems = node.health.problem_count("camera")
+        problems = node.health.problems["camera"]
         PaperCamera.left = 4
         bench.spin_until(lambda: images and images[-1].data[0] == 0)
-        bench.spin_until(lambda before=problems: node.health.problem_count("camera") > before)
+        bench.spin_until(lambda before=problems: node.health.problems["camera"] > before)
     assert (images[-1].width, images[-1].height, images[-1].step) == (64, 48, 64)
-    assert node.health.problem_count("size") > 0
+    assert node.health.problems["size"] > 0
     bench.spin_until(lambda: any("camera 7" in report.status[0].message for report in reports))
 
 

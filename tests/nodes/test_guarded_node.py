@@ -90,7 +90,7 @@ def test_bad_input_is_refused_by_its_kind_and_is_no_failure(bench, broken):
     poses = bench.publisher(PoseStamped, "pose")
     broken.error = PoseError("it is nowhere")
     poses.publish(pose_at(0.0, 1))
-    bench.spin_until(lambda: broken.health.problem_count("pose") == 1)
+    bench.spin_until(lambda: broken.health.problems["pose"] == 1)
     assert not broken.failures
 
 

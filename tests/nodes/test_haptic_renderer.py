@@ -107,9 +107,9 @@ def test_any_doubt_makes_it_zero_until_there_is_none(bench, arm, doubt, kind, re
     else:
         handle.models.publish(Float64MultiArray(data=[1.0, 2.0, 3.0]))
     bench.spin_until(lambda: felt(wrenches) == 0.0)
-    bench.spin_until(lambda: node.health.problem_count("doubt") == 1)
+    bench.spin_until(lambda: node.health.problems["doubt"] == 1)
     assert reason in node.health.measure()["stopped"]
-    assert not kind or node.health.problem_count(kind) == 1
+    assert not kind or node.health.problems[kind] == 1
     if doubt == "clutch":
         handle.clutch.publish(Bool(data=False))
         bench.spin_for(10)

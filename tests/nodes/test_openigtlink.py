@@ -42,7 +42,7 @@ tracker:
     node = bench.make(ProbeTracker, scene=scene_with(tmp_path, small_scene, tracker))
     poses = bench.collect(PoseStamped, "probe/pose")
     states = bench.collect(DiagnosticStatus, "probe/status", latched=True)
-    bench.spin_until(lambda: node.health.problem_count("connection") > 0)
+    bench.spin_until(lambda: node.health.problems["connection"] > 0)
     for turn in (1, 2):
         poses.clear()
         with pyigtl_server(port) as server:

@@ -246,7 +246,7 @@ def test_what_cannot_be_made_is_set_back_and_said(bench, pressed):
     old = {name: node.get_parameter(name).value for name in asked}
     parameters = [Parameter(name, value=value) for name, value in asked.items()]
     assert node.set_parameters_atomically(parameters).successful
-    bench.spin_until(lambda: node.health.problem_count("setting") == 1)
+    bench.spin_until(lambda: node.health.problems["setting"] == 1)
     assert {name: node.get_parameter(name).value for name in asked} == old
     bench.spin_until(
         lambda: any(
@@ -270,7 +270,7 @@ def test_what_is_set_back_may_be_what_two_settings_say_together(bench, pressed):
         Parameter("msds.time_step", value=5.0),
     ]
     assert node.set_parameters_atomically(parameters).successful
-    assert node.health.problem_count("setting") == 1
+    assert node.health.problems["setting"] == 1
     assert node.get_parameter("solver").value == "fem"
     assert node.get_parameter("compare_with").value == "msds"
     bench.spin_for(3)

@@ -215,7 +215,7 @@ def test_of_a_damaged_recording_the_rest_is_played_and_what_is_missing_is_said(b
     bench.spin_until(lambda: player.finished.done() and said and said[-1].data == "099")
     sentence = str(player.finished.exception())
     assert re.match("not all .*damaged.mcap .* chunk at byte", sentence)
-    assert player.health.problem_count("damage") == 1
+    assert player.health.problems["damage"] == 1
     assert not player.failures
 
 

@@ -75,7 +75,7 @@ def test_what_cannot_be_done_is_said_and_moves_nothing(bench, commands, name, me
     node, twists, forces, _, poses = commands
     reports = bench.collect(DiagnosticArray, "diagnostics")
     (twists if name == "robot/twist" else forces).publish(message)
-    bench.spin_until(lambda: node.health.problem_count(kind) == 1)
+    bench.spin_until(lambda: node.health.problems[kind] == 1)
     before = len(poses)
     bench.spin_until(lambda: len(poses) > before + 5)
     assert {(p.pose.position.x, p.pose.position.z) for p in poses} == {(0.0, -0.005)}

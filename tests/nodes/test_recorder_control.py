@@ -230,7 +230,7 @@ def test_losses_are_told(bench, quiet, may_write):
     reports = bench.collect(DiagnosticArray, "diagnostics")
     try:
         say(bench, recorder, note, *("x" * 93 for _ in range(30)))  # 100 bytes each
-        bench.spin_until(lambda: recorder.health.problem_count("lost") > 0)
+        bench.spin_until(lambda: recorder.health.problems["lost"] > 0)
         bench.spin_until(
             lambda: any("/note not recorded" in each.status[0].message for each in reports)
         )
@@ -382,7 +382,7 @@ def test_a_full_disk_is_said_and_survived(bench, quiet, monkeypatch):
         ]
 
     bench.spin_until(lambda: any("No space left on device" in text for text in told()))
-    assert recorder.health.problem_count("disk") == 1
+    assert recorder.health.problems["disk"] == 1
     full[0] = False
     bench.spin_until(lambda: not recorder.health.warning)
     say(bench, recorder, note, "three")

@@ -138,7 +138,7 @@ def test_the_graph_goes_along_when_the_clock_jumps_back(graph, back):
     graph.bench.spin_until(lambda: len(graph.images) > 20)
     assert (np.diff(stamps(graph.images)) > 0).all()
     require_sound(graph.reports(2.5))
-    assert not graph.tracker.health.problem_count("order")
+    assert not graph.tracker.health.problems["order"]
 
 
 def test_a_recorder_begins_when_simulated_time_does(bench, tmp_path):

@@ -82,7 +82,7 @@ def test_the_face_meets_the_skin_where_the_scene_has_one(bench, small_scene):
     assert touching.mean() > 20.0
     assert in_air.mean() < 0.2 * touching.mean()
     skins.publish(cloud(skin[1:], pose_at(0.003, 3)))
-    bench.spin_until(lambda: node.health.problem_count("skin") == 1)
+    bench.spin_until(lambda: node.health.problems["skin"] == 1)
 
 
 def test_an_image_is_cut_at_the_pose_with_the_nodes_stamp(bench, slicer, small_scene):
@@ -121,7 +121,7 @@ def test_nodes_that_are_not_finite_make_no_image_and_are_reported(bench, slicer)
         nodes.publish(cloud(points, pose_at(0.0, second)))
     bench.spin_until(lambda: images)
     assert images[0].header.stamp.sec == 3
-    assert node.health.problem_count("mesh") == 2
+    assert node.health.problems["mesh"] == 2
 
 
 def test_without_tissue_the_volume_is_cut_as_it_is(bench, tmp_path):

@@ -127,14 +127,14 @@ def test_a_device_that_is_pulled_out_is_waited_for(bench, device):
     device.is_there = False
     node = bench.make(SpaceMouseDriver)
     joys = bench.collect(Joy, "spacenav/joy")
-    bench.spin_until(lambda: node.health.problem_count("device") > 0)
+    bench.spin_until(lambda: node.health.problems["device"] > 0)
     for _ in range(2):
         device.is_there = True
         joys.clear()
         bench.spin_until(lambda: joys)
         device.is_there = False
-        problems = node.health.problem_count("device")
-        bench.spin_until(lambda before=problems: node.health.problem_count("device") > before + 1)
+        problems = node.health.problems["device"]
+        bench.spin_until(lambda before=problems: node.health.problems["device"] > before + 1)
     assert node.health.state == "no device"
     assert "plug it in" in node.health.fault
 

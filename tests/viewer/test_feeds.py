@@ -164,7 +164,7 @@ def test_what_cannot_be_shown_is_said_and_the_next_is_shown(
     publisher.publish(odd)
     bench.spin_until(lambda: feed.sequence == 1)
     assert feed.get_newest() is None
-    assert watcher.health.problem_count("volume") == 1
+    assert watcher.health.problems["volume"] == 1
     assert sentence in watcher.health._last_problem
     good = speckle(4, 4, 3)
     sound = image_message(good, Time(), "probe") if kind == "annotated" else None
@@ -294,12 +294,12 @@ def test_skin_that_cannot_be_used_is_said_and_what_was_there_stays(graph):
     graph.newest("skin_mesh")
     nodes = graph.bench.publisher(PointCloud2, "skin/nodes")
     for wrong in (SQUARE[:3], SQUARE * np.nan):
-        before = graph.node.health.problem_count("mesh")
+        before = graph.node.health.problems["mesh"]
         sequence = graph.feeds["skin"].sequence
         nodes.publish(cloud(wrong))
         graph.bench.spin_until(lambda s=sequence: graph.feeds["skin"].sequence > s)
         assert graph.feeds["skin"].get_newest() is None
-        assert graph.node.health.problem_count("mesh") == before + 1
+        assert graph.node.health.problems["mesh"] == before + 1
     nodes.publish(cloud(SQUARE))
     assert graph.newest("skin").header["points"] == 4
 
@@ -330,7 +330,7 @@ def test_tetrahedra_of_nodes_that_there_are_not_are_refused(graph):
     huge[3, 2] = 2**30
     graph.latch(Int32MultiArray, "tissue/tetrahedra", tetrahedra_message(huge))
     graph.feeds["tissue_mesh"].add_watcher(unused)
-    graph.bench.spin_until(lambda: graph.node.health.problem_count("mesh") > 0)
+    graph.bench.spin_until(lambda: graph.node.health.problems["mesh"] > 0)
     assert graph.feeds["tissue_mesh"].get_newest() is None
 
 

@@ -98,7 +98,7 @@ def test_what_is_offered_is_awaited(bench, stander):
 def test_a_skin_that_is_none_is_refused_and_said(bench, stander):
     publisher = bench.peer.create_publisher(Mesh, "skin/mesh", LATCHED)
     publisher.publish(mesh_message(np.zeros((3, 3)), np.array([[0, 1, 2]])))
-    bench.spin_until(lambda: stander.health.problem_count("mesh") == 1)
+    bench.spin_until(lambda: stander.health.problems["mesh"] == 1)
     assert "no triangle with an area" in stander.health._last_problem
 
 

@@ -342,7 +342,7 @@ class Health:
         self._hardware_id = hardware_id or ""
         self._latencies: deque[float] = deque(maxlen=1000)  # ms
         self._published: Counter[str] = Counter()
-        self._problems: Counter[str] = Counter()
+        self.problems: Counter[str] = Counter()  # by kind
         self._last_problem = self._last_kind = ""
         self.warning = ""  # what is wrong at present
         self.fault = ""  # the same, if it keeps the node from its work
@@ -381,14 +381,10 @@ class Health:
 
     def count_problem(self, kind: str, sentence: str) -> None:
         """Count and log a problem; one that goes on is logged ever more rarely."""
-        self._problems[kind] += 1
+        self.problems[kind] += 1
         self._last_problem, self._last_kind = loggable_text(sentence), kind
         if self._node.is_log_due(kind):
             self._node.get_logger().warning(self._last_problem)
-
-    def problem_count(self, kind: str) -> int:
-        """Return the number of problems of a kind."""
-        return self._problems[kind]
 
     def _report_first(self) -> None:
         self._first.cancel()
@@ -410,7 +406,7 @@ class Health:
             **({"problem": self._last_kind} if self._last_problem else {}),
             **({"scheduling": self.scheduling} if self.scheduling else {}),
             **{f"published {topic}": str(n) for topic, n in self._published.items()},
-            **{f"rejected {kind}": str(n) for kind, n in self._problems.items()},
+            **{f"rejected {kind}": str(n) for kind, n in self.problems.items()},
             **{f"failed {where}": str(n) for where, n in node.failures.items()},
             **self.values,
             **self.measure(),
