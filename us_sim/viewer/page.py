@@ -20,7 +20,7 @@ from nicegui import ui
 from us_sim.errors import UsSimError
 from us_sim.slicing.settings import OVERLAYS, STRIPS
 from us_sim.viewer.export import LARGEST, decode_frames, encode_video
-from us_sim.viewer.panels.asking import find_refusal, is_taken, set_parameter
+from us_sim.viewer.panels.asking import find_refusal, notify_refusal, set_parameter
 from us_sim.viewer.panels.exercise import ExercisePanel
 from us_sim.viewer.panels.nodes import TISSUE, build_image, build_status, build_tissue
 from us_sim.viewer.panels.session import CasesPanel, SessionPanel
@@ -96,7 +96,7 @@ class ModeBar:
 
     async def _set(self, name: str, value: object) -> bool:
         """Set a parameter of the node; return whether the node took the value."""
-        return is_taken(await set_parameter(self._node, name, value))
+        return not notify_refusal(await set_parameter(self._node, name, value))
 
     @property
     def _overlay(self) -> Any:

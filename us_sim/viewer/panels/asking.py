@@ -36,8 +36,8 @@ async def ask_session(board: SessionBoard, **values: object) -> str:
     return find_refusal() or await await_answer(board.ask_control(**values), CONTROL)
 
 
-def is_taken(refusal: str) -> bool:
-    """Show a refusal to the person, if there is one; return whether there is none."""
+def notify_refusal(refusal: str) -> bool:
+    """Show a refusal to the person, if there is one; return whether there is."""
     if refusal:
         ui.notify(refusal, type="warning", multi_line=True)
-    return not refusal
+    return bool(refusal)

@@ -16,11 +16,11 @@ from us_sim.viewer.panels.asking import (
     ask_session,
     enable_control,
     find_refusal,
-    is_taken,
+    notify_refusal,
     set_parameter,
 )
 from us_sim.viewer.panels.controls import WhileShown
-from us_sim.viewer.panels.session import ask_to_load, is_confirmed
+from us_sim.viewer.panels.session import ask_confirmation, ask_to_load
 from us_sim.viewer.parameters import format_name
 from us_sim.viewer.score import PICTURE, SCORE, get_score, is_blind
 from us_sim.viewer.stream import Feed, Simulator
@@ -216,24 +216,24 @@ class ExercisePanel:
             refusal = await set_parameter(self._scorer, "answers", answers)
             if refusal:
                 self._given = []
-        is_taken(refusal)
+        notify_refusal(refusal)
 
     async def _clear(self) -> None:
         score = self._score or {}
-        if not is_taken(find_refusal()):
+        if notify_refusal(find_refusal()):
             return
         sentence = f"It ends the attempt at {score.get('name', '')}."
-        if score.get("state") == "running" and not await is_confirmed("Begin anew", sentence):
+        if score.get("state") == "running" and not await ask_confirmation("Begin anew", sentence):
             return
         if score.get("about", {}).get("feedback") == "afterwards":  # another arm: this one is known
             origin = self._board.state.origin.partition("#")[0]
-            is_taken(await ask_session(self._board, scene=origin))
+            notify_refusal(await ask_session(self._board, scene=origin))
         else:
             self._simulator.ask_scorer("clear")
 
     async def _draw(self) -> bool:
         """Have the scorer draw the picture anew; return whether it did."""
-        if not is_taken(find_refusal()):
+        if notify_refusal(find_refusal()):
             return False
         feed = self._simulator.feeds[PICTURE]
         before = feed.sequence

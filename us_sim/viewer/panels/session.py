@@ -11,7 +11,7 @@ from typing import Any
 from nicegui import ui
 
 from us_sim.scene.listing import ListedScene
-from us_sim.viewer.panels.asking import ask_session, enable_control, is_taken
+from us_sim.viewer.panels.asking import ask_session, enable_control, notify_refusal
 from us_sim.viewer.panels.controls import WhileShown
 from us_sim.viewer.score import get_score
 from us_sim.viewer.session import NOT_THERE, SessionState
@@ -106,12 +106,12 @@ async def ask_to_load(simulator: Simulator, scene: ListedScene) -> bool:
     ends = [f"the recording {record}, which is kept as it is"] if record else []
     ends += [f"the attempt at {score['name']}"] if score.get("state") == "running" else []
     sentence = f"Loading {scene.name} ends {', and '.join(ends)}."
-    if ends and not await is_confirmed("Load", sentence):
+    if ends and not await ask_confirmation("Load", sentence):
         return False
-    return is_taken(await ask_session(simulator.session, scene=scene.origin))
+    return not notify_refusal(await ask_session(simulator.session, scene=scene.origin))
 
 
-async def is_confirmed(what: str, sentence: str) -> bool:
+async def ask_confirmation(what: str, sentence: str) -> bool:
     """Ask the person for agreement; return the answer."""
     with ui.dialog() as dialog, ui.card():
         dialog.props["aria-label"] = what
@@ -328,7 +328,7 @@ class SessionPanel:
         finally:
             self._asking -= 1
             self._answered = time.monotonic()
-        return is_taken(refusal)
+        return not notify_refusal(refusal)
 
 
 def describe_recording(state: SessionState) -> tuple[str, bool]:
