@@ -1,4 +1,4 @@
-"""A page server whose simulator is the test's own."""
+"""A page server whose sources are the test's own."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -7,7 +7,7 @@ import pytest
 from bench import Bench
 from chromium import watched
 
-from us_sim.viewer.stream import Simulator
+from us_sim.viewer.stream import PageSources
 
 EMPTY = '<link rel="icon" href="data:,">'
 """A document in which nothing runs and which asks for nothing."""
@@ -23,24 +23,24 @@ def bench() -> Iterator[Bench]:
 
 @pytest.fixture(scope="session")
 def served() -> Iterator[Any]:
-    """The one server that a process may have; its simulator is emptied for each test."""
+    """The one server that a process may have; its sources are emptied for each test."""
     pytest.importorskip("nicegui", reason="nicegui is not installed")
     from us_sim.viewer.server import WebServer
 
-    simulator = Simulator()
-    server = WebServer(simulator, port=0)
-    yield server, simulator
+    sources = PageSources()
+    server = WebServer(sources, port=0)
+    yield server, sources
     server.close()
 
 
 @pytest.fixture
-def simulator(served: Any) -> Simulator:
-    """The simulator of :func:`page`, which shows nothing yet."""
-    _, simulator = served
-    empty = Simulator()
+def sources(served: Any) -> PageSources:
+    """The sources of :func:`page`, which shows nothing yet."""
+    _, sources = served
+    empty = PageSources()
     for name, value in vars(empty).items():
-        setattr(simulator, name, value)
-    return simulator
+        setattr(sources, name, value)
+    return sources
 
 
 @pytest.fixture(scope="session")
@@ -79,7 +79,7 @@ def tabs(profile: Any, served: Any) -> Callable[[], tuple[Any, list[str]]]:
 
 
 @pytest.fixture
-def page(tabs: Any, simulator: Simulator) -> Iterator[Any]:  # noqa: ARG001
+def page(tabs: Any, sources: PageSources) -> Iterator[Any]:  # noqa: ARG001
     """A page of 1280 × 720 that is not loaded yet: ``page.goto(page.address)`` does.
 
     Afterwards it is refused what no page may have: errors, on the console or otherwise, and

@@ -1,4 +1,4 @@
-"""A simulator for pages whose hand only remembers what it was asked."""
+"""Sources for pages whose hand only remembers what it was asked."""
 
 import time
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from us_sim.skin.surface import plane_surface
-from us_sim.viewer.stream import Feed, Packet, Simulator
+from us_sim.viewer.stream import Feed, Packet, PageSources
 from us_sim.viewer.surfaces import ColouredSurface, StreamedSurface, make_transducer_packet
 
 PIXEL = 8e-5  # m
@@ -19,13 +19,13 @@ STANCE = {"x": 0.012, "y": 0.0, "z": 0.0, "press": 0.0042, "rotation": 0.0, "fan
 class FakeHand:
     """Feeds ``image``, ``hand`` and ``score``, and the command ``hand``."""
 
-    def __init__(self, simulator: Simulator) -> None:
+    def __init__(self, sources: PageSources) -> None:
         self.asked: list[dict[str, Any]] = []
         self.image, self.state = Feed("image", rate=None), Feed("hand", rate=None)
         self.score = Feed("score", rate=None)
-        simulator.add_feeds(self.image, self.state, self.score)
-        simulator.commands["hand"] = self._take
-        simulator.commands["take"] = self._take_over
+        sources.add_feeds(self.image, self.state, self.score)
+        sources.commands["hand"] = self._take
+        sources.commands["take"] = self._take_over
         self.takes: list[Any] = []  # pages that were to take the probe
         self.say()
         self.show()
@@ -63,7 +63,7 @@ class FakeHand:
             time.sleep(0.02)
 
 
-def show_patient(simulator: Simulator) -> None:
+def show_patient(sources: PageSources) -> None:
     """Feed a flat piece of skin and a probe that stands on it."""
     skin, mesh, pose = (Feed(kind, rate=None) for kind in ("skin_mesh", "probe_mesh", "probe"))
     sheet = plane_surface((0.16, 0.16), 0.02)
@@ -74,7 +74,7 @@ def show_patient(simulator: Simulator) -> None:
     mesh.offer_packet(lambda n: make_transducer_packet("probe_mesh", n, [body], outline))
     header = {"stamp": "1", "position": FACE, "quaternion": [0, 0, 0, 1]}
     pose.offer_packet(lambda n: Packet("probe", n, header, b""))
-    simulator.add_feeds(skin, mesh, pose)
+    sources.add_feeds(skin, mesh, pose)
 
 
 def _box(lower: list[float], upper: list[float]) -> tuple[Any, Any]:

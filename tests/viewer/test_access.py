@@ -9,7 +9,7 @@ import pytest
 from us_sim.errors import UsSimError
 from us_sim.viewer.access import AccessControl, is_loopback
 from us_sim.viewer.server import WebServer
-from us_sim.viewer.stream import Simulator
+from us_sim.viewer.stream import PageSources
 
 
 def asked(
@@ -149,4 +149,4 @@ def test_loopback_is_told_from_other_addresses() -> None:
 def test_a_token_that_is_no_secret_or_no_part_of_an_address_is_refused(token: str) -> None:
     pytest.importorskip("nicegui", reason="nicegui is not installed")
     with pytest.raises(UsSimError, match="16 letters, digits"):
-        WebServer(Simulator(), "0.0.0.0", 0, token)
+        WebServer(PageSources(), "0.0.0.0", 0, token)

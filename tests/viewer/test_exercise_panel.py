@@ -16,7 +16,7 @@ from us_sim.nodes.qos import LATCHED
 from us_sim.viewer.remote_parameters import make_answer
 from us_sim.viewer.score import PICTURE, SCORE, connect_scorer
 from us_sim.viewer.session import SessionBoard, SessionState
-from us_sim.viewer.stream import CallPoster, Feed, Packet, Simulator
+from us_sim.viewer.stream import CallPoster, Feed, Packet, PageSources
 
 STEPS = (
     {"what": "vein at 9 mm", "state": "done", "seen": "closed at 6.0 N"},
@@ -30,10 +30,10 @@ PNG = base64.b64decode(
 class Scorer:
     """The streams of a score, and what pages ask of it: it draws at once."""
 
-    def __init__(self, simulator):
+    def __init__(self, sources):
         self.score, self.picture = Feed(SCORE, rate=None), Feed(PICTURE, rate=None)
-        simulator.add_feeds(self.score, self.picture)
-        simulator.ask_scorer = self._take
+        sources.add_feeds(self.score, self.picture)
+        sources.ask_scorer = self._take
         self.asked = []
 
     def _take(self, what):
@@ -58,8 +58,8 @@ def open_panel(page, scorer, query=""):
     until(lambda: scorer.picture.is_watched, "the panel is seen")
 
 
-def test_task_steps_and_score_are_shown_begun_anew_and_saved(page, simulator):
-    scorer = Scorer(simulator)
+def test_task_steps_and_score_are_shown_begun_anew_and_saved(page, sources):
+    scorer = Scorer(sources)
     open_panel(page, scorer)
     page.get_by_text("No exercise is followed: choose one.").wait_for()
     scorer.say(STEPS)
@@ -88,14 +88,14 @@ def test_task_steps_and_score_are_shown_begun_anew_and_saved(page, simulator):
     until(lambda: not scorer.picture.is_watched, "another tab is chosen")
 
 
-def test_a_blind_exercise_hides_the_truth_and_asks(page, simulator):
-    scorer, asked = Scorer(simulator), []
+def test_a_blind_exercise_hides_the_truth_and_asks(page, sources):
+    scorer, asked = Scorer(sources), []
 
     async def answer(name, value):
         asked.append((name, value))
         return ""
 
-    simulator.nodes.get_node("scorer").set_value = answer
+    sources.nodes.get_node("scorer").set_value = answer
     steps = [{**STEPS[1], "what": what} for what in ("point 1", "point 2", "thrombus")]
     open_panel(page, scorer)
     scorer.say(steps, feedback="afterwards")
@@ -113,7 +113,7 @@ def test_a_blind_exercise_hides_the_truth_and_asks(page, simulator):
     page.get_by_role("button", name="Outlines").wait_for()
 
 
-def test_to_begin_a_blind_exercise_anew_loads_another_arm(page, simulator):
+def test_to_begin_a_blind_exercise_anew_loads_another_arm(page, sources):
     """The arm of before is known: the scorer does not clear it, the exercise is drawn again."""
     asked = []
 
@@ -121,8 +121,8 @@ def test_to_begin_a_blind_exercise_anew_loads_another_arm(page, simulator):
         asked.append(values)
         return make_answer("")
 
-    scorer, simulator.session = Scorer(simulator), SessionBoard(send=send)
-    simulator.session.state = SessionState(
+    scorer, sources.session = Scorer(sources), SessionBoard(send=send)
+    sources.session.state = SessionState(
         is_there=True, scene="arm", origin="exercise:examination#675"
     )
     open_panel(page, scorer)
@@ -144,15 +144,15 @@ def test_to_begin_a_blind_exercise_anew_loads_another_arm(page, simulator):
         ("not passed", [], "Begin anew starts another attempt"),
     ],
 )
-def test_a_hint_is_of_the_moment_and_the_task(page, simulator, state, target, hint):
-    scorer = Scorer(simulator)
+def test_a_hint_is_of_the_moment_and_the_task(page, sources, state, target, hint):
+    scorer = Scorer(sources)
     open_panel(page, scorer)
     scorer.say([{**STEPS[1], "target": target}], state=state)
     page.get_by_text(hint).wait_for()
 
 
-def test_who_only_watches_answers_and_erases_nothing(page, simulator):
-    scorer = Scorer(simulator)
+def test_who_only_watches_answers_and_erases_nothing(page, sources):
+    scorer = Scorer(sources)
     open_panel(page, scorer, "?watch")
     scorer.say(STEPS, feedback="afterwards")
     page.get_by_text("To do: vein at <b>29 mm, not reached").wait_for()
@@ -162,11 +162,11 @@ def test_who_only_watches_answers_and_erases_nothing(page, simulator):
 
 @pytest.fixture
 def heard(bench: Bench):
-    """The simulator that a node fills."""
+    """The sources that a node fills."""
     node = bench.add(GuardedNode("viewer", context=bench.context))
-    simulator = Simulator()
-    connect_scorer(node, CallPoster(node), simulator)
-    return simulator
+    sources = PageSources()
+    connect_scorer(node, CallPoster(node), sources)
+    return sources
 
 
 def test_what_the_scorer_says_is_heard_while_a_page_shows_it(bench, heard):

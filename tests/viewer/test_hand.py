@@ -6,12 +6,12 @@ from typing import Any
 import pytest
 from fake_hand import MATRIX, PIXEL, STANCE, FakeHand
 
-from us_sim.viewer.stream import Simulator
+from us_sim.viewer.stream import PageSources
 
 
 @pytest.fixture
-def viewer(page: Any, simulator: Simulator) -> FakeHand:
-    viewer = FakeHand(simulator)
+def viewer(page: Any, sources: PageSources) -> FakeHand:
+    viewer = FakeHand(sources)
     page.goto(page.address)
     page.wait_for_function("document.querySelector('.us-image')?.width === 320")
     page.wait_for_function("document.querySelector('.us-quantity input')?.disabled === false")

@@ -23,7 +23,7 @@ from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.viewer.remote_parameters import RemoteParameters
 from us_sim.viewer.session import ViewerSession
 from us_sim.viewer.status import StatusListener
-from us_sim.viewer.stream import CallPoster, Simulator
+from us_sim.viewer.stream import CallPoster, PageSources
 
 EVIL = " ".join(
     (
@@ -46,14 +46,14 @@ def status_of(name: str, **values: str) -> DiagnosticStatus:
 
 
 @pytest.fixture
-def stranger(simulator: Simulator) -> Iterator[None]:
+def stranger(sources: PageSources) -> Iterator[None]:
     """Somebody on the graph who says all that nodes say of themselves, with hostile texts."""
     bench = Bench()
     viewer = bench.add(GuardedNode("viewer", context=bench.context))
     post = CallPoster(viewer)
-    simulator.session = ViewerSession(viewer, post)
-    simulator.nodes = RemoteParameters(viewer)
-    simulator.status = StatusListener(viewer, post)
+    sources.session = ViewerSession(viewer, post)
+    sources.nodes = RemoteParameters(viewer)
+    sources.status = StatusListener(viewer, post)
     for name in NODES:
         node = bench.add(Node(name, context=bench.context))
         about = ParameterDescriptor(
@@ -93,8 +93,8 @@ def stranger(simulator: Simulator) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("stranger")
-def test_no_text_of_others_becomes_part_of_the_page(page: Any, simulator: Simulator) -> None:
-    hand = FakeHand(simulator)
+def test_no_text_of_others_becomes_part_of_the_page(page: Any, sources: PageSources) -> None:
+    hand = FakeHand(sources)
     hand.say(leader="nobody", obstacle=EVIL, warning=EVIL)
     page.goto(page.address)
     page.locator("#us-panels").click()

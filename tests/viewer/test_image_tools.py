@@ -10,7 +10,7 @@ import pytest
 from awaiting import until
 
 from us_sim.viewer.session import SessionState
-from us_sim.viewer.stream import Feed, Packet, Simulator
+from us_sim.viewer.stream import Feed, Packet, PageSources
 
 COLUMNS, ROWS = 400, 300
 ACROSS, DOWN = 1e-4, 1.4e-4  # m a pixel: not square
@@ -21,9 +21,9 @@ TOOLS = "/us_sim/assets/image_tools"
 class Images:
     """Images whose grey value is their number, each a second after the one before."""
 
-    def __init__(self, simulator: Simulator) -> None:
+    def __init__(self, sources: PageSources) -> None:
         self.feed = Feed("image", rate=None)
-        simulator.add_feeds(self.feed)
+        sources.add_feeds(self.feed)
 
     def show(self, grey: int, **known: Any) -> None:
         stamp = {"stamp": str(grey * 10**9), "encoding": "mono8"}
@@ -37,8 +37,8 @@ pytestmark = pytest.mark.usefixtures("images")
 
 
 @pytest.fixture
-def images(page: Any, simulator: Simulator) -> Images:
-    images = Images(simulator)
+def images(page: Any, sources: PageSources) -> Images:
+    images = Images(sources)
     images.show(40)
     page.goto(page.address)
     page.wait_for_selector(".us-image-bar")
@@ -59,9 +59,9 @@ def await_grey(page: Any, grey: int) -> None:
 
 
 def test_nothing_is_drawn_or_measured_before_the_first_image(
-    browser: Any, served: Any, simulator: Simulator, images: Images
+    browser: Any, served: Any, sources: PageSources, images: Images
 ) -> None:
-    simulator.feeds["image"] = Feed("image", rate=None)
+    sources.feeds["image"] = Feed("image", rate=None)
     page = browser.new_page(viewport={"width": 1280, "height": 720})
     page.goto(served[0].addresses[0])
     page.get_by_text("Waiting for the first image").wait_for()
@@ -84,7 +84,7 @@ def test_nothing_is_drawn_or_measured_before_the_first_image(
     assert not page.evaluate(f"import('{TOOLS}/freeze.js').then(m => m.freeze.isFrozen)")
     page.keyboard.press("p")
     assert page.evaluate(f"import('{TOOLS}/picture.js').then(m => m.picture())") is None
-    simulator.feeds["image"] = images.feed
+    sources.feeds["image"] = images.feed
     page.evaluate("import('/us_sim/assets/stream.js').then(m => m.stream.reconnect())")
     page.wait_for_function(drawn)
     until(button.is_enabled, "distances can be measured")
@@ -303,10 +303,10 @@ def test_the_loop_has_no_image_that_was_taken_long_before_the_others(
 
 
 def test_of_another_scene_no_image_is_kept_frozen_or_on_the_plane(
-    page: Any, images: Images, simulator: Simulator
+    page: Any, images: Images, sources: PageSources
 ) -> None:
     def scene(name: str) -> None:
-        simulator.session.state = SessionState(is_there=True, scene=name)
+        sources.session.state = SessionState(is_there=True, scene=name)
         page.locator(f"#us-scene[data-scene={name}]").wait_for(state="attached")
 
     plane = "import('/us_sim/assets/scene/probe.js').then(m => m.probe.image.visible)"
@@ -390,14 +390,14 @@ def test_an_image_is_compared_with_those_that_come_as_it_is_seen_and_saved(
     assert page.locator(".us-facts").inner_text() == ""
 
 
-def show_annotated(page: Any, simulator: Simulator, columns: int, rows: int) -> None:
+def show_annotated(page: Any, sources: PageSources, columns: int, rows: int) -> None:
     """A picture in colour in place of the image, as wide and high as that."""
     encoded = cv2.imencode(".jpg", np.full((rows, columns, 3), 90, np.uint8))[1].tobytes()
     feed = Feed("annotated", rate=None)
     header = {"stamp": str(41 * 10**9), "rows": rows, "columns": columns, "encoding": "jpeg"}
     header["matrix"] = MATRIX
     feed.offer_packet(lambda n: Packet("annotated", n, header, encoded))
-    simulator.add_feeds(feed)
+    sources.add_feeds(feed)
     page.evaluate("import('/us_sim/assets/image.js').then(m => m.setMode('annotated'))")
     page.wait_for_function(
         f"""() => {{
@@ -409,13 +409,13 @@ def show_annotated(page: Any, simulator: Simulator, columns: int, rows: int) -> 
 
 
 def test_the_annotated_picture_is_measured_as_the_image_below_it(
-    page: Any, simulator: Simulator
+    page: Any, sources: PageSources
 ) -> None:
     page.keyboard.press("d")
     drag(page, at(page, -8, 5), at(page, 4, 5))
     lengths = values(page)
     page.keyboard.press(" ")
-    show_annotated(page, simulator, COLUMNS, ROWS)
+    show_annotated(page, sources, COLUMNS, ROWS)
     page.get_by_role("button", name="Distance", exact=True).click()
     drag(page, at(page, 0, 6), at(page, 0, 33))
     lengths += values(page)
@@ -427,10 +427,10 @@ def test_the_annotated_picture_is_measured_as_the_image_below_it(
 
 
 def test_a_picture_of_another_size_is_not_measured_and_says_why(
-    page: Any, simulator: Simulator
+    page: Any, sources: PageSources
 ) -> None:
     button = page.get_by_role("button", name="Distance", exact=True)
-    show_annotated(page, simulator, 80, 60)
+    show_annotated(page, sources, 80, 60)
     until(button.is_disabled, "distances cannot be measured")
     assert "another size than the B-mode image" in button.get_attribute("title")
     page.keyboard.press("d")
@@ -457,10 +457,10 @@ def test_the_last_seconds_are_saved_as_they_are_seen(
 
 
 def test_a_strip_is_frozen_with_the_image_and_saved_below_it(
-    page: Any, simulator: Simulator, tmp_path: Path
+    page: Any, sources: PageSources, tmp_path: Path
 ) -> None:
     feed = Feed("m_mode", rate=None)
-    simulator.add_feeds(feed)
+    sources.add_feeds(feed)
 
     def show(blue: int) -> None:
         strip = np.full((60, 300, 3), (blue, 20, 20), np.uint8)

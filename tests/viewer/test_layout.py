@@ -14,7 +14,7 @@ from us_sim.scene.listing import ListedScene
 from us_sim.viewer.parameters import Parameter, ParameterKind
 from us_sim.viewer.session import SessionState
 from us_sim.viewer.status import NodeLevel, NodeStatus
-from us_sim.viewer.stream import Simulator
+from us_sim.viewer.stream import PageSources
 
 PHONE = 390, 844
 FOUR_TIMES = 320, 180  # what a window of 1280 × 720 holds when magnified
@@ -32,20 +32,20 @@ Open = Callable[..., Any]
 
 
 @pytest.fixture
-def hand(simulator: Simulator) -> FakeHand:
-    """A simulator that has something to show in every part of the page."""
-    hand = FakeHand(simulator)
-    show_patient(simulator)
-    simulator.nodes = FakeNodes()
-    simulator.nodes.tell(*PARAMETERS)
-    simulator.session.state = SessionState(True, "running", "upper_arm", "/arm.yaml")
-    simulator.session.scenes = (
+def hand(sources: PageSources) -> FakeHand:
+    """Sources that have something to show in every part of the page."""
+    hand = FakeHand(sources)
+    show_patient(sources)
+    sources.nodes = FakeNodes()
+    sources.nodes.tell(*PARAMETERS)
+    sources.session.state = SessionState(True, "running", "upper_arm", "/arm.yaml")
+    sources.session.scenes = (
         ListedScene("upper_arm", "/arm.yaml", description="An arm.", tracker="pose"),
         ListedScene("sweep", "case:/sweep", "case", problem="volume.file: is missing"),
     )
     now = time.monotonic()
-    simulator.status.add_report(NodeStatus(NODE, NodeLevel.WELL, "runs"), now)
-    simulator.status.add_report(
+    sources.status.add_report(NodeStatus(NODE, NodeLevel.WELL, "runs"), now)
+    sources.status.add_report(
         NodeStatus("probe_tracker", NodeLevel.ERROR, "the probe is lost"), now
     )
     return hand

@@ -11,7 +11,7 @@ from fake_nodes import FakeNodes
 
 from us_sim.viewer.parameters import Parameter, ParameterKind
 from us_sim.viewer.status import NodeLevel, NodeStatus
-from us_sim.viewer.stream import Feed, Packet, Simulator
+from us_sim.viewer.stream import Feed, Packet, PageSources
 
 NODE = "slice_interpolator"
 PIXEL = "() => {{ const c = document.querySelector('{}'); return c ? Array.from("
@@ -30,7 +30,7 @@ def known(value: str, is_flipped: bool = False) -> list[Parameter]:
 
 
 @pytest.fixture
-def asked(simulator: Simulator) -> list[str]:
+def asked(sources: PageSources) -> list[str]:
     """The modes that the node was asked to show; it refuses velocity."""
     values: list[str] = []
 
@@ -38,34 +38,34 @@ def asked(simulator: Simulator) -> list[str]:
         values.append(raw)
         if raw == "velocity":
             return "overlay: this scene has nothing for 'velocity'"
-        simulator.nodes.tell(*known(raw))
+        sources.nodes.tell(*known(raw))
         return ""
 
-    simulator.nodes = FakeNodes(take)
-    simulator.nodes.tell(*known("none"))
+    sources.nodes = FakeNodes(take)
+    sources.nodes.tell(*known("none"))
     return values
 
 
-def coloured(simulator: Simulator, kind: str, bgr: tuple[int, int, int]) -> Feed:
+def coloured(sources: PageSources, kind: str, bgr: tuple[int, int, int]) -> Feed:
     """A stream with one picture of that colour."""
     feed = Feed(kind)
     picture = np.full((32, 32, 3), bgr, np.uint8)
     jpeg = cv2.imencode(".jpg", picture)[1].tobytes()
     header = {"stamp": "1", "rows": 32, "columns": 32, "encoding": "jpeg"}
     feed.offer_packet(lambda sequence: Packet(kind, sequence, header, jpeg))
-    simulator.add_feeds(feed)
+    sources.add_feeds(feed)
     return feed
 
 
 def test_a_mode_is_asked_for_shown_and_left(
-    page: Any, simulator: Simulator, asked: list[str]
+    page: Any, sources: PageSources, asked: list[str]
 ) -> None:
     plain = Feed("image")
     pixels = np.full((32, 32), 90, np.uint8).tobytes()
     header = {"stamp": "1", "rows": 32, "columns": 32, "encoding": "mono8"}
     plain.offer_packet(lambda sequence: Packet("image", sequence, header, pixels))
-    simulator.add_feeds(plain)
-    annotated = coloured(simulator, "annotated", (0, 0, 200))
+    sources.add_feeds(plain)
+    annotated = coloured(sources, "annotated", (0, 0, 200))
     page.goto(page.address)
     image = PIXEL.format(".us-image")
     page.wait_for_function(f"({image})()?.[0] === 90")
@@ -83,8 +83,8 @@ def test_a_mode_is_asked_for_shown_and_left(
 
 
 @pytest.mark.usefixtures("asked")
-def test_a_refused_mode_says_why_and_stays_as_it_was(page: Any, simulator: Simulator) -> None:
-    annotated = coloured(simulator, "annotated", (0, 0, 200))
+def test_a_refused_mode_says_why_and_stays_as_it_was(page: Any, sources: PageSources) -> None:
+    annotated = coloured(sources, "annotated", (0, 0, 200))
     page.goto(page.address)
     page.get_by_role("button", name="Colour").click()
     page.get_by_text("this scene has nothing for 'velocity'").wait_for()
@@ -93,9 +93,9 @@ def test_a_refused_mode_says_why_and_stays_as_it_was(page: Any, simulator: Simul
 
 
 @pytest.mark.usefixtures("asked")
-def test_why_an_image_shows_little_is_said_on_it(page: Any, simulator: Simulator) -> None:
+def test_why_an_image_shows_little_is_said_on_it(page: Any, sources: PageSources) -> None:
     def see(**values: str) -> None:
-        simulator.status.add_report(
+        sources.status.add_report(
             NodeStatus(NODE, NodeLevel.WELL, "imaging", values), time.monotonic()
         )
 
@@ -115,7 +115,7 @@ def test_why_an_image_shows_little_is_said_on_it(page: Any, simulator: Simulator
     is_said()
     page.get_by_role("button", name="Outlines").click()
     page.get_by_role("button", name="Outlines", pressed=True).wait_for()
-    simulator.nodes.tell(*known("velocity"))
+    sources.nodes.tell(*known("velocity"))
     is_said("No colour: the beams cross")
     see(contact="poor", no_colour="no_contact", no_spectrum="no_vessel")
     is_said("Poor contact")
@@ -124,22 +124,22 @@ def test_why_an_image_shows_little_is_said_on_it(page: Any, simulator: Simulator
     see(contact="good", no_colour="", no_spectrum="")
     is_said()
     tissue = NodeStatus("tissue_deformer", NodeLevel.WELL, "fem", {"force": "24.20"})
-    simulator.status.add_report(tissue, time.monotonic())
+    sources.status.add_report(tissue, time.monotonic())
     is_said("Too much force: 24 N")
     words = "3 tetrahedra are inside out: msds is not made for this (set solver)"
     tissue = NodeStatus("tissue_deformer", NodeLevel.WARNING, words, {"problem": "inside out"})
-    simulator.status.add_report(tissue, time.monotonic())
+    sources.status.add_report(tissue, time.monotonic())
     is_said("Tissue is inside out")
     tissue = NodeStatus("tissue_deformer", NodeLevel.WELL, "fem", {"unbalanced": "1"})
-    simulator.status.add_report(tissue, time.monotonic())
+    sources.status.add_report(tissue, time.monotonic())
     is_said()
 
 
 @pytest.mark.parametrize(("name", "kind"), [("M-mode", "m_mode"), ("Spectrum", "spectrum")])
 def test_a_strip_is_watched_while_it_is_shown(
-    page: Any, simulator: Simulator, name: str, kind: str
+    page: Any, sources: PageSources, name: str, kind: str
 ) -> None:
-    feed = coloured(simulator, kind, (200, 0, 0))
+    feed = coloured(sources, kind, (200, 0, 0))
     page.goto(page.address)
     button = page.get_by_role("button", name=name)
     button.click()
@@ -151,13 +151,13 @@ def test_a_strip_is_watched_while_it_is_shown(
 
 
 def test_flip_is_asked_for_and_followed_where_it_was_set_elsewhere(
-    page: Any, simulator: Simulator, asked: list[Any]
+    page: Any, sources: PageSources, asked: list[Any]
 ) -> None:
     page.goto(page.address)
     flip = page.get_by_role("button", name="Flip")
     flip.click()
     until(lambda: asked == [True], "the node is asked")
-    simulator.nodes.tell(*known("none", is_flipped=True))
+    sources.nodes.tell(*known("none", is_flipped=True))
     until(lambda: flip.get_attribute("aria-pressed") == "true", "it is flipped")
     flip.click()
     until(lambda: asked == [True, False], "the node is asked for the other")

@@ -11,7 +11,7 @@ from awaiting import until
 
 from us_sim.errors import UsSimError
 from us_sim.viewer.server import open_socket
-from us_sim.viewer.stream import Feed, Packet, Simulator
+from us_sim.viewer.stream import Feed, Packet, PageSources
 
 PIXEL = 1e-4  # m
 MATRIX = [PIXEL, 0, 0, -0.0256, 0, 0, 0, 0, 0, PIXEL, 0, PIXEL / 2, 0, 0, 0, 1]
@@ -29,16 +29,16 @@ def offer(feed: Feed, pixels: Any) -> None:
     feed.offer_packet(lambda sequence: Packet("image", sequence, header, pixels.tobytes()))
 
 
-def feeds_of(simulator: Simulator) -> tuple[Feed, list[bool]]:
+def feeds_of(sources: PageSources) -> tuple[Feed, list[bool]]:
     told: list[bool] = []
     image = Feed("image", told.append)
-    simulator.add_feeds(image)
+    sources.add_feeds(image)
     return image, told
 
 
 @pytest.mark.smoke
-def test_pixels_are_drawn_as_they_were_sent(page: Any, simulator: Simulator) -> None:
-    image, _ = feeds_of(simulator)
+def test_pixels_are_drawn_as_they_were_sent(page: Any, sources: PageSources) -> None:
+    image, _ = feeds_of(sources)
     pixels = np.random.default_rng(1).integers(0, 256, (300, 512), dtype=np.uint8)
     offer(image, pixels)
     page.goto(page.address)
@@ -53,11 +53,11 @@ def test_pixels_are_drawn_as_they_were_sent(page: Any, simulator: Simulator) -> 
     ("force", "words"), [({}, "no images come"), ({"force_age": 0.7}, "the tissue does not answer")]
 )
 def test_an_image_is_not_said_to_be_still_where_nothing_comes(
-    page: Any, simulator: Simulator, force: dict[str, float], words: str
+    page: Any, sources: PageSources, force: dict[str, float], words: str
 ) -> None:
-    image, _ = feeds_of(simulator)
+    image, _ = feeds_of(sources)
     hand, probe = Feed("hand", rate=None), Feed("probe", rate=None)
-    simulator.add_feeds(hand, probe)
+    sources.add_feeds(hand, probe)
     place = {"stamp": "1", "position": [0, 0, 0], "quaternion": [0, 0, 0, 1], **force}
     probe.offer_packet(lambda sequence: Packet("probe", sequence, place, b""))
     hand.offer_packet(lambda sequence: Packet("hand", sequence, {"is_resting": True}, b""))
@@ -71,8 +71,8 @@ def test_an_image_is_not_said_to_be_still_where_nothing_comes(
     page.wait_for_function(f"document.querySelector('#readout').textContent === '{words}'")
 
 
-def test_a_page_finds_the_viewer_again(page: Any, simulator: Simulator) -> None:
-    image, _ = feeds_of(simulator)
+def test_a_page_finds_the_viewer_again(page: Any, sources: PageSources) -> None:
+    image, _ = feeds_of(sources)
     page.goto(page.address)
     until(lambda: image.is_watched, "the page watches the image")
     page.evaluate("import('/us_sim/assets/stream.js').then(m => m.stream.reconnect())")
@@ -133,9 +133,9 @@ def test_a_taken_port_is_said(served: Any) -> None:
 
 
 def test_an_image_that_is_not_followed_by_another_is_marked(
-    page: Any, simulator: Simulator
+    page: Any, sources: PageSources
 ) -> None:
-    image, _ = feeds_of(simulator)
+    image, _ = feeds_of(sources)
     pixels = np.zeros((8, 8), np.uint8)
     offer(image, pixels)
     page.goto(page.address)

@@ -10,7 +10,7 @@ from fake_nodes import FakeNodes
 
 from us_sim.viewer.parameters import Parameter, ParameterKind
 from us_sim.viewer.status import NodeLevel, NodeStatus
-from us_sim.viewer.stream import ONLY_WATCHES, Simulator
+from us_sim.viewer.stream import ONLY_WATCHES, PageSources
 
 NODE = "slice_interpolator"
 
@@ -37,11 +37,11 @@ PARAMETERS = (
 class Node:
     """In place of a node: takes what it is sent, or refuses it, and tells the page."""
 
-    def __init__(self, simulator: Simulator) -> None:
+    def __init__(self, sources: PageSources) -> None:
         self.sent: list[tuple[float, str, Any]] = []
         self.refusal = ""
         self.parameters = {parameter.name: parameter for parameter in PARAMETERS}
-        self.nodes = simulator.nodes = FakeNodes(self._take)
+        self.nodes = sources.nodes = FakeNodes(self._take)
         self.tell()
 
     def tell(self, *parameters: Parameter) -> None:
@@ -59,8 +59,8 @@ class Node:
 
 
 @pytest.fixture
-def node(simulator: Simulator) -> Node:
-    return Node(simulator)
+def node(sources: PageSources) -> Node:
+    return Node(sources)
 
 
 def opened(page: Any, tab: str) -> None:
@@ -203,8 +203,8 @@ def test_nothing_is_watched_that_cannot_be_seen(page: Any, node: Node) -> None:
     until(lambda: node.nodes.watched == set(), "the page has gone")
 
 
-def test_status(page: Any, simulator: Simulator, node: Node) -> None:
-    board = simulator.status
+def test_status(page: Any, sources: PageSources, node: Node) -> None:
+    board = sources.status
     values = {"state": "fem", "rate_hz": "59.9", "latency_p50_ms": "7.04", "latency_p99_ms": "120"}
     values |= {"received": "300", "dropped": "3", "residual": "1e-3"}
     opened(page, "Status")

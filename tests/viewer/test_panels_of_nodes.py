@@ -14,18 +14,18 @@ from rclpy.parameter import Parameter
 
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.viewer.remote_parameters import RemoteParameters
-from us_sim.viewer.stream import Simulator
+from us_sim.viewer.stream import PageSources
 
 NODE = "slice_interpolator"
 
 
 @pytest.fixture
-def graph(simulator: Simulator) -> Iterator[Node]:
+def graph(sources: PageSources) -> Iterator[Node]:
     """A node whose parameters the panels show, spun beside the test."""
     bench = Bench()
     node = bench.add(Node(NODE, context=bench.context))
     asking = bench.add(GuardedNode("viewer", context=bench.context))
-    simulator.nodes = RemoteParameters(asking)
+    sources.nodes = RemoteParameters(asking)
     ended = threading.Event()
 
     def spin() -> None:

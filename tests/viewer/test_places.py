@@ -10,7 +10,7 @@ from fake_nodes import FakeNodes
 from us_sim.slicing.probe.beams import convert_to_pixels
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, compute_image_outline
 from us_sim.viewer.parameters import Parameter, ParameterKind
-from us_sim.viewer.stream import Feed, Packet, Simulator
+from us_sim.viewer.stream import Feed, Packet, PageSources
 from us_sim.viewer.surfaces import make_transducer_packet
 
 NODE = "slice_interpolator"
@@ -22,14 +22,14 @@ BUTTONS = {"colour": "Outlines", "spectrum": "Spectrum", "m_mode": "M-mode"}
 class Node:
     """The simulator's part: parameters that are set, and a picture of a probe."""
 
-    def __init__(self, simulator: Simulator, probe: Probe, steering: float, flip: bool) -> None:
+    def __init__(self, sources: PageSources, probe: Probe, steering: float, flip: bool) -> None:
         self.values: dict[str, Any] = {"depth": probe.depth, "overlay": "velocity"}
         for kind in ("colour", "spectrum"):
             self.values |= {f"{kind}.lateral": 0.1, f"{kind}.depth": 0.02}
             self.values[f"{kind}.steering"] = steering
         self.values |= {"colour.width": 0.4, "colour.height": 0.01, "spectrum.size": 0.002}
         self.values["m_mode.lateral"] = 0.1
-        simulator.nodes = self._nodes = FakeNodes(self._take)
+        sources.nodes = self._nodes = FakeNodes(self._take)
         self._tell()
         matrix = probe.image_to_probe.copy()
         if flip:
@@ -45,8 +45,8 @@ class Node:
             ),
         }
         for kind, pack in packets.items():
-            simulator.add_feeds(Feed(kind))
-            simulator.feeds[kind].offer_packet(pack)
+            sources.add_feeds(Feed(kind))
+            sources.feeds[kind].offer_packet(pack)
 
     def _tell(self) -> None:
         made = []
@@ -71,9 +71,9 @@ class Node:
     ],
 )
 def test_what_is_dragged_looks_where_it_was_dragged_to(
-    page: Any, simulator: Simulator, kind: str, probe: Probe, steering: float, flip: bool
+    page: Any, sources: PageSources, kind: str, probe: Probe, steering: float, flip: bool
 ) -> None:
-    node = Node(simulator, probe, steering, flip)
+    node = Node(sources, probe, steering, flip)
 
     def place() -> np.ndarray:
         """Column and row where it looks."""

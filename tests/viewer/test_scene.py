@@ -15,7 +15,7 @@ from us_sim.geometry.transducer import build_transducer_mesh
 from us_sim.skin.surface import plane_surface
 from us_sim.slicing.probe.probe import LinearProbe, compute_image_outline
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
-from us_sim.viewer.stream import Feed, Packet, Simulator
+from us_sim.viewer.stream import Feed, Packet, PageSources
 from us_sim.viewer.surfaces import (
     CarriedSurfaces,
     ColouredSurface,
@@ -42,7 +42,7 @@ def cube(name: str, colour: tuple[float, float, float], middle: list[float]) -> 
 class Patient:
     """Feeds of a flat skin over tissue with two cubes in it, and a probe beside."""
 
-    def __init__(self, simulator: Simulator) -> None:
+    def __init__(self, sources: PageSources) -> None:
         faces = MESH.boundary
         edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
         self.tissue = StreamedSurface(MESH.nodes, faces, edges)
@@ -65,7 +65,7 @@ class Patient:
             "probe",
         ]
         self.feeds = {kind: Feed(kind) for kind in [*kinds, "image", "score"]}
-        simulator.add_feeds(*self.feeds.values())
+        sources.add_feeds(*self.feeds.values())
         self._offer("skin_mesh", lambda n: self.skin.make_rest_packet("skin_mesh", n))
         self._offer("tissue_mesh", lambda n: self.tissue.make_rest_packet("tissue_mesh", n))
         self._offer(
@@ -114,9 +114,9 @@ class Patient:
 
 
 @pytest.fixture
-def scene_of(page: Any, simulator: Simulator) -> Callable[[], SimpleNamespace]:
+def scene_of(page: Any, sources: PageSources) -> Callable[[], SimpleNamespace]:
     """Loads the page with a patient in it, seen from above."""
-    patient = Patient(simulator)
+    patient = Patient(sources)
     return lambda: opened(page, patient)
 
 

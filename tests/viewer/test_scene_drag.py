@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from fake_hand import FACE, FakeHand, show_patient
 
-from us_sim.viewer.stream import Packet, Simulator
+from us_sim.viewer.stream import Packet, PageSources
 
 SCENE = "import('/us_sim/assets/scene/scene.js')"
 CAMERA = f"() => {SCENE}.then(m => m.stage.camera.position.toArray())"
 
 
 @pytest.fixture
-def hand(page: Any, simulator: Simulator) -> FakeHand:
-    hand = FakeHand(simulator)
-    show_patient(simulator)
+def hand(page: Any, sources: PageSources) -> FakeHand:
+    hand = FakeHand(sources)
+    show_patient(sources)
     page.emulate_media(reduced_motion="reduce")  # the view turns at once
     page.goto(page.address)
     page.evaluate(f"async () => {{ window.scene = await {SCENE}; }}")

@@ -14,7 +14,7 @@ RUNNING = SessionState(True, "running", "upper_arm", "/arm.yaml")
 
 
 @pytest.fixture
-def session(simulator):
+def session(sources):
     """The session that pages see, and what they asked of it."""
     asked = []
 
@@ -24,9 +24,9 @@ def session(simulator):
         asked.append(dict(values))
         return told
 
-    simulator.session = SessionBoard(send=ask)
-    simulator.session.state = RUNNING
-    return simulator.session, asked
+    sources.session = SessionBoard(send=ask)
+    sources.session.state = RUNNING
+    return sources.session, asked
 
 
 def opened(page, tab):
@@ -85,14 +85,14 @@ def test_who_only_watches_loads_and_records_nothing(page, session):
     assert asked == []
 
 
-def test_an_exercise_is_not_ended_unasked(page, session, simulator):
+def test_an_exercise_is_not_ended_unasked(page, session, sources):
     board, asked = session
     board.scenes = (ListedScene("liver", "case:/liver", "case"),)
     step = {"what": "press", "seen": "", "state": "to do"}
     header = {"name": "compression", "description": "", "scene": "upper_arm", "metrics": {}}
     header |= {"state": "running", "plain": {}, "about": {}, "faults": []}
-    simulator.add_feeds(Feed("score"))
-    simulator.feeds["score"].offer_packet(
+    sources.add_feeds(Feed("score"))
+    sources.feeds["score"].offer_packet(
         lambda n: Packet("score", n, {**header, "steps": [step]}, b"")
     )
     page.goto(page.address)

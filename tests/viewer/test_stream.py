@@ -9,7 +9,7 @@ from awaiting import until
 from hypothesis import given
 from hypothesis import strategies as st
 
-from us_sim.viewer.stream import ONLY_WATCHES, Feed, Packet, PageStream, Simulator
+from us_sim.viewer.stream import ONLY_WATCHES, Feed, Packet, PageSources, PageStream
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.text(),
@@ -69,9 +69,9 @@ def test_what_cannot_be_packed_is_none_and_not_tried_again() -> None:
 
 
 def stream_of(*feeds: Feed) -> tuple[PageStream, list[None]]:
-    simulator, woken = Simulator(), []
-    simulator.add_feeds(*feeds)
-    return PageStream(simulator, lambda: woken.append(None)), woken
+    sources, woken = PageSources(), []
+    sources.add_feeds(*feeds)
+    return PageStream(sources, lambda: woken.append(None)), woken
 
 
 def test_a_page_gets_the_newest_when_it_has_drawn_the_last() -> None:
@@ -117,11 +117,11 @@ def test_what_a_page_may_not_say_is_one_sentence() -> None:
 
 
 def test_a_page_that_only_watches_is_refused_every_command() -> None:
-    simulator, done = Simulator(feeds={"image": Feed("image")}), []
-    simulator.commands["take"] = lambda value, _: done.append(value)
-    page = PageStream(simulator, lambda: None, only_watches=True)
+    sources, done = PageSources(feeds={"image": Feed("image")}), []
+    sources.commands["take"] = lambda value, _: done.append(value)
+    page = PageStream(sources, lambda: None, only_watches=True)
     assert page.obey_message('{"watch": ["image"], "take": "a"}') == ONLY_WATCHES
-    assert simulator.feeds["image"].is_watched
+    assert sources.feeds["image"].is_watched
     assert done == []
 
 
@@ -148,10 +148,10 @@ TAKE = """async () => {
 
 
 def test_no_more_is_on_its_way_than_the_next_while_one_is_drawn(
-    page: Any, simulator: Simulator
+    page: Any, sources: PageSources
 ) -> None:
     slow, quick = Feed("slow", rate=None), Feed("quick", rate=None)
-    simulator.add_feeds(slow, quick)
+    sources.add_feeds(slow, quick)
     page.goto(page.address)
     page.evaluate(TAKE)
     until(lambda: slow.is_watched and quick.is_watched, "the page watches")

@@ -28,7 +28,7 @@ from us_sim.viewer.hand import PatientSurface, ViewerHand
 from us_sim.viewer.hand_command import HandCommand
 from us_sim.viewer.parameters import Parameter, ParameterKind
 from us_sim.viewer.session import SessionBoard, SessionState
-from us_sim.viewer.stream import CallPoster, Feed, Simulator
+from us_sim.viewer.stream import CallPoster, Feed, PageSources
 
 
 class Stander(GuardedNode):
@@ -109,8 +109,8 @@ class Holder(GuardedNode):
         super().__init__("viewer", **kwargs)
         self.health = Health(self, "test")
         self.post = CallPoster(self)
-        self.simulator = Simulator()
-        self.hand = ViewerHand(self, self.post, self.simulator, RestMeshListener(self))
+        self.sources = PageSources()
+        self.hand = ViewerHand(self, self.post, self.sources, RestMeshListener(self))
 
 
 class Page:
@@ -123,7 +123,7 @@ class Page:
     def __call__(self, **wish):
         self._sequence += 1
         asked = {"source": "page", "sequence": self._sequence, **wish}
-        return self._holder.simulator.commands["hand"](asked, 1)
+        return self._holder.sources.commands["hand"](asked, 1)
 
     def open(self):
         self.feed.add_watcher(self.nothing)
@@ -188,14 +188,14 @@ def test_while_blood_or_time_is_watched_the_resting_probe_is_imaged_as_if_it_mov
 ):
     page.open()
     bench.spin_until(lambda: len(tracked) >= 2 and page.state.get("is_resting"))
-    simulator = page._holder.simulator
+    sources = page._holder.sources
     overlay = Parameter("slice_interpolator", "overlay", ParameterKind.TEXT, "velocity")
-    simulator.nodes.get_node("slice_interpolator").parameters = {"overlay": overlay}
+    sources.nodes.get_node("slice_interpolator").parameters = {"overlay": overlay}
     for kind in ("m_mode", "spectrum", "annotated"):
-        simulator.add_feeds(Feed(kind))
-        simulator.feeds[kind].add_watcher(page.nothing)
+        sources.add_feeds(Feed(kind))
+        sources.feeds[kind].add_watcher(page.nothing)
         bench.spin_until(lambda: not page.state["is_resting"])
-        simulator.feeds[kind].remove_watcher(page.nothing)
+        sources.feeds[kind].remove_watcher(page.nothing)
         bench.spin_until(lambda: page.state["is_resting"])
 
 
@@ -238,11 +238,11 @@ def test_the_pose_that_contains_a_wish_is_known_by_its_stamp(bench, page, tracke
 def test_the_first_page_that_moves_the_probe_holds_it_until_it_goes_or_another_takes_over(
     bench, page
 ):
-    simulator = page._holder.simulator
+    sources = page._holder.sources
 
     def other(connection, **wish):
         asked = {"source": "other", "sequence": 1, **wish}
-        return simulator.commands["hand"](asked, connection)
+        return sources.commands["hand"](asked, connection)
 
     def held_by(holder):
         bench.spin_until(lambda: page.state["holder"] == holder)
@@ -256,14 +256,14 @@ def test_the_first_page_that_moves_the_probe_holds_it_until_it_goes_or_another_t
     assert other(2, to={"x": 0.037}).startswith("another page holds the probe: Take over")
     bench.spin_for(5)
     assert page.state["goal"]["x"] == 0.0
-    assert simulator.commands["take"]("other", 2) is None
+    assert sources.commands["take"]("other", 2) is None
     held_by("other")
     assert "Take over" in page(by={"press": 0.001})
-    for leave in simulator.leaving:
+    for leave in sources.leaving:
         leave(1)  # which is not the holder
     bench.spin_for(5)
     held_by("other")
-    for leave in simulator.leaving:
+    for leave in sources.leaving:
         leave(2)
     held_by("")
     assert other(3) is None  # it comes back, and holds what nobody holds
@@ -339,8 +339,8 @@ def test_a_replay_is_ended_on_request_and_nothing_else_is(bench, page):
     done = Future()
     done.set_result("")
     board = SessionBoard(send=lambda values: asked.append(values) or done)
-    holder.simulator.session = board
-    take = holder.simulator.commands["take"]
+    holder.sources.session = board
+    take = holder.sources.commands["take"]
     page.open()
     page.await_leader("hand")
     assert take("page", 1) is None

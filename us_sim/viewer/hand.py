@@ -35,7 +35,7 @@ from us_sim.tracking.virtual_hand import (
 from us_sim.viewer.feeds import RestMeshListener
 from us_sim.viewer.hand_command import HOME_PRESS, SINGLE, HandCommand, is_source
 from us_sim.viewer.session import SessionState
-from us_sim.viewer.stream import CallPoster, Feed, Packet, Simulator
+from us_sim.viewer.stream import CallPoster, Feed, Packet, PageSources
 
 MOVING_HZ = 60.0 if (os.cpu_count() or 1) > 2 else 30.0
 """Poses a second; on two cores, which the browser shares, a page shows no more images than 30."""
@@ -172,19 +172,19 @@ class ViewerHand:
     Args:
         node: the node that publishes.
         post: runs calls in the node's thread.
-        simulator: gets the stream ``hand`` and the commands ``hand`` and ``take``.
+        sources: gets the stream ``hand`` and the commands ``hand`` and ``take``.
         rest: follows the tissue's mesh, on which the probe stands where there is no skin.
     """
 
     def __init__(
-        self, node: GuardedNode, post: CallPoster, simulator: Simulator, rest: RestMeshListener
+        self, node: GuardedNode, post: CallPoster, sources: PageSources, rest: RestMeshListener
     ) -> None:
-        self._node, self._post, self._simulator = node, post, simulator
+        self._node, self._post, self._sources = node, post, sources
         # Sliders that follow at 10 Hz look smooth, and more would take time from the image.
         self.feed = Feed("hand", lambda _: post(self._on_watch), 10.0)
-        simulator.add_feeds(self.feed)
-        simulator.commands |= {"hand": self._on_command, "take": self._on_take}
-        simulator.leaving.append(self._on_leave)
+        sources.add_feeds(self.feed)
+        sources.commands |= {"hand": self._on_command, "take": self._on_take}
+        sources.leaving.append(self._on_leave)
         self._state = HandState.IDLE
         self._lead = ProbeLead("nobody", "the viewer finds out who moves the probe")
         self._surface = PatientSurface(node, rest)
@@ -233,7 +233,7 @@ class ViewerHand:
         before, self._state = self._state, state
         is_watched = state is not HandState.IDLE
         if is_watched != (before is not HandState.IDLE):
-            session = self._simulator.session
+            session = self._sources.session
             (session.add_page if is_watched else session.remove_page)()
             self._surface.follow_meshes(is_watched)
             self._subscriptions.set_active(is_watched)
@@ -291,12 +291,12 @@ class ViewerHand:
             self._enter(HandState.RESTING)
         if self._state is HandState.RESTING:
             self._publish()
-            if self._simulator.is_changing_by_itself:
+            if self._sources.is_changing_by_itself:
                 self._enter(HandState.MOVING)
 
     def _find_lead(self) -> ProbeLead:
         """Return who moves the probe; "nobody" while the surface or the probe's pose is unknown."""
-        session = self._simulator.session.state
+        session = self._sources.session.state
         lead = find_lead(self._node, session, is_publishing=self._state.holds_probe)
         if lead.obstacle:
             return lead
@@ -371,7 +371,7 @@ class ViewerHand:
     def _on_take(self, page: Any, connection: int) -> str | None:
         """Give a page the probe, whichever page held it, and end a replay that moves it."""
         if self._lead.can_take:
-            self._simulator.session.ask_control(replay="")
+            self._sources.session.ask_control(replay="")
         elif self._lead.obstacle:
             return self._lead.obstacle
         if is_source(page):
@@ -403,7 +403,7 @@ class ViewerHand:
             self._moved_at = time.monotonic()
             self._motion.advance(min(self._moved_at - self._sent_at, longest))
         self._publish()
-        if self._motion.is_at_rest and not self._simulator.is_changing_by_itself:
+        if self._motion.is_at_rest and not self._sources.is_changing_by_itself:
             self._enter(HandState.RESTING)
             self._tell()
 

@@ -28,7 +28,7 @@ from us_sim.viewer.parameters import ParameterKind
 from us_sim.viewer.score import get_score, is_blind
 from us_sim.viewer.session import SessionState
 from us_sim.viewer.status import PageCounter
-from us_sim.viewer.stream import PageStream, Simulator
+from us_sim.viewer.stream import PageSources, PageStream
 
 NODE, OVERLAY, FLIP, BESIDE = "slice_interpolator", "overlay", "flip", "beside"
 MODES = {
@@ -62,8 +62,8 @@ _UNMOVED = 1e-5  # m, or part of the face: a smaller drag does not move a place
 class ModeBar:
     """The bar of the image's modes, strips and switches."""
 
-    def __init__(self, simulator: Simulator) -> None:
-        self._simulator, self._node = simulator, simulator.nodes.get_node(NODE)
+    def __init__(self, sources: PageSources) -> None:
+        self._sources, self._node = sources, sources.nodes.get_node(NODE)
         self._mode = "b-mode"
         self._buttons: dict[str, ui.button] = {}
         self._strips: dict[str, bool] = dict.fromkeys(STRIPS, False)
@@ -81,7 +81,7 @@ class ModeBar:
         bar.on("us-place", lambda event: self._move(event.args.get("detail")), ["detail"])
         self._mark()
         self._remarks: list[str] = []
-        _watch_while_connected(self._node, simulator.status)
+        _watch_while_connected(self._node, sources.status)
         ui.timer(0.3, self._refresh)
 
     async def _choose(self, mode: str) -> None:
@@ -131,7 +131,7 @@ class ModeBar:
         known = self._overlay
         if self._mode != "b-mode" and known in MODES and known != self._mode:
             self._show(known)
-        hides = is_blind(get_score(self._simulator))
+        hides = is_blind(get_score(self._sources))
         if hides and self._mode != "b-mode":
             self._show("b-mode")
         for name in (*MODES, BESIDE):
@@ -142,10 +142,10 @@ class ModeBar:
 
     def _list_remarks(self) -> list[str]:
         """Return the reasons why the images show little, for a person."""
-        status = self._simulator.status.find_node(NODE, time.monotonic())
+        status = self._sources.status.find_node(NODE, time.monotonic())
         values = status.values if status else {}
         remarks = [_CONTACT.get(values.get("contact", ""), "")]
-        tissue = self._simulator.status.find_node(TISSUE, time.monotonic())
+        tissue = self._sources.status.find_node(TISSUE, time.monotonic())
         force = (tissue.read_number("force") if tissue else None) or 0.0
         if force > 20.0:  # N; sonographers press with some 5 to 10
             remarks.append(f"Too much force: {force:.0f} N")
@@ -241,9 +241,9 @@ def describe_scene(state: SessionState) -> tuple[str, str]:
     return name, " · ".join(filter(None, parts))
 
 
-def build_headline(simulator: Simulator) -> None:
+def build_headline(sources: PageSources) -> None:
     """Build the scene's name, its state and its problem inside the header."""
-    board, nodes = simulator.session, simulator.status
+    board, nodes = sources.session, sources.status
     name = ui.label().classes("us-scene-name").props('id="us-scene"')
     words = ui.label().classes("us-headline").props('role="status"')
     problem = ui.label().classes("us-headline us-wrong").props('role="alert"')
@@ -294,7 +294,7 @@ PANELS = [
 """Name, icon of Material's, title, and the function that fills the tab."""
 
 
-def build_page(simulator: Simulator) -> None:
+def build_page(sources: PageSources) -> None:
     """Build the page for one browser."""
     ui.add_head_html(_HEAD)
     ui.add_body_html('<script type="module" src="/us_sim/assets/main.js"></script>')
@@ -302,7 +302,7 @@ def build_page(simulator: Simulator) -> None:
     ui.query(".nicegui-content").classes("us-content")
     with ui.header(wrap=False).classes("us-header"):
         ui.label("us_sim").classes("us-brand").props("role=heading aria-level=1")
-        build_headline(simulator)
+        build_headline(sources)
         ui.space()
         _block("readout")
         button = ui.button(icon="tune").props("flat round dense id=us-panels")
@@ -311,12 +311,12 @@ def build_page(simulator: Simulator) -> None:
             _block("scene")
             _block("hand")
         with _section("us-right", "Ultrasound"):
-            ModeBar(simulator)
+            ModeBar(sources)
             _block("ultrasound")
             _block("strips")
             _block("image-tools")
         with _section("us-drawer", "Panels") as drawer:
-            tabs, tissue = _build_panels(simulator)
+            tabs, tissue = _build_panels(sources)
     drawer.set_visibility(False)
     button.props["title"] = "Panels: image, tissue, cases, session, exercise, status"
     button.props["aria-label"] = "Panels"
@@ -328,7 +328,7 @@ def build_page(simulator: Simulator) -> None:
 
     def show_exercise() -> None:
         """Open the panel of an exercise once, if the window has room beside the 3D view."""
-        if get_score(simulator).get("steps"):
+        if get_score(sources).get("steps"):
             asking.deactivate()
             tabs.set_value("Exercise")
             if not drawer.visible:
@@ -337,7 +337,7 @@ def build_page(simulator: Simulator) -> None:
 
     def hide_truth() -> None:
         """Hide the panel that shows the truth while an exercise asks for it."""
-        hides = is_blind(get_score(simulator))
+        hides = is_blind(get_score(sources))
         tissue.set_visibility(not hides)
         if hides and tabs.value == TISSUE_TAB:
             tabs.set_value("Exercise")
@@ -359,7 +359,7 @@ def _section(name: str, label: str) -> ui.element:
     return section
 
 
-def _build_panels(simulator: Simulator) -> tuple[ui.tabs, ui.tab]:
+def _build_panels(sources: PageSources) -> tuple[ui.tabs, ui.tab]:
     """Build the panels; return their tabs, and the tissue's tab."""
     made = {}
     with ui.tabs().props("dense no-caps").classes("us-tabs") as tabs:
@@ -369,14 +369,14 @@ def _build_panels(simulator: Simulator) -> tuple[ui.tabs, ui.tab]:
     with ui.tab_panels(tabs, value=PANELS[0][0]).classes("us-panels"):
         for name, _, _, build in PANELS:
             with ui.tab_panel(name):
-                build(simulator)
+                build(sources)
     return tabs, made[TISSUE_TAB]
 
 
 ASSETS = Path(__file__).parent / "assets"
 
 
-def make_application(simulator: Simulator) -> Any:
+def make_application(sources: PageSources) -> Any:
     """Make the ASGI application of a viewer; a process can have one."""
     # It logs every unknown path as it was sent, with its control characters for a terminal.
     logging.getLogger("nicegui").setLevel(logging.ERROR)
@@ -385,7 +385,7 @@ def make_application(simulator: Simulator) -> Any:
 
     @app.websocket("/us_sim/stream")
     async def stream(websocket: WebSocket) -> None:
-        await serve_page(websocket, simulator)
+        await serve_page(websocket, sources)
 
     @app.post("/us_sim/export")
     async def export(request: Request) -> Response:
@@ -402,7 +402,7 @@ def make_application(simulator: Simulator) -> Any:
 
     @ui.page("/")
     def page() -> None:
-        build_page(simulator)
+        build_page(sources)
 
     # NiceGUI's progress bar above the page tells nothing that a person waits for.
     nicegui_app.config.quasar_config["loadingBar"]["skipHijack"] = True
@@ -422,7 +422,7 @@ def make_application(simulator: Simulator) -> Any:
     return app
 
 
-async def serve_page(websocket: WebSocket, simulator: Simulator) -> None:
+async def serve_page(websocket: WebSocket, sources: PageSources) -> None:
     """Serve one page's websocket until it closes."""
     await websocket.accept()
     loop = asyncio.get_running_loop()
@@ -432,7 +432,7 @@ async def serve_page(websocket: WebSocket, simulator: Simulator) -> None:
         if not loop.is_closed():
             loop.call_soon_threadsafe(awake.set)
 
-    page = PageStream(simulator, wake, only_watches="watch" in websocket.query_params)
+    page = PageStream(sources, wake, only_watches="watch" in websocket.query_params)
     sending = asyncio.ensure_future(_send(websocket, page, awake))
     try:
         while True:
@@ -444,7 +444,7 @@ async def serve_page(websocket: WebSocket, simulator: Simulator) -> None:
     finally:
         sending.cancel()
         page.watch_kinds([])
-        for command in simulator.leaving:
+        for command in sources.leaving:
             command(page.number)
 
 

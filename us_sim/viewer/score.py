@@ -18,15 +18,15 @@ from us_sim.nodes.topics import FROZEN
 from us_sim.recording import MARKER
 from us_sim.scoring.settings import STATES
 from us_sim.viewer.feeds import make_topic_feed
-from us_sim.viewer.stream import CallPoster, Packet, Simulator
+from us_sim.viewer.stream import CallPoster, Packet, PageSources
 
 SCORE, PICTURE = "score", "score_picture"
 """Streams of an exercise's steps and metrics, and of their picture as PNG."""
 _STATES = {DiagnosticStatus.OK: "done", DiagnosticStatus.ERROR: "missed"}
 
 
-def connect_scorer(node: GuardedNode, post: CallPoster, simulator: Simulator) -> None:
-    """Add the score's feeds, requests to `scorer`, and marks of frozen images to the simulator."""
+def connect_scorer(node: GuardedNode, post: CallPoster, sources: PageSources) -> None:
+    """Add the score's feeds, requests to `scorer`, and marks of frozen images to the sources."""
     marks = node.create_stream_publisher(String, MARKER, STREAM)
     services = {name: node.create_client(Trigger, f"scorer/{name}") for name in ("clear", "draw")}
 
@@ -39,14 +39,14 @@ def connect_scorer(node: GuardedNode, post: CallPoster, simulator: Simulator) ->
             post(lambda: marks.publish(String(data=FROZEN)))
         return None
 
-    simulator.commands["frozen"] = mark
-    simulator.ask_scorer = lambda what: post(lambda: ask(what))
+    sources.commands["frozen"] = mark
+    sources.ask_scorer = lambda what: post(lambda: ask(what))
     for message_type, topic, make, kind in (
         (DiagnosticArray, "score", make_score_packet, SCORE),
         (CompressedImage, "score/picture", _make_picture_packet, PICTURE),
     ):
         feed = make_topic_feed(node, post, message_type, topic, make, kind, None, LATCHED)
-        simulator.add_feeds(feed)
+        sources.add_feeds(feed)
 
 
 def make_score_packet(message: DiagnosticArray, sequence: int) -> Packet:
@@ -77,9 +77,9 @@ def make_score_packet(message: DiagnosticArray, sequence: int) -> Packet:
     return Packet(SCORE, sequence, header, b"")
 
 
-def get_score(simulator: Simulator) -> Mapping[str, Any]:
+def get_score(sources: PageSources) -> Mapping[str, Any]:
     """Return the newest score of the running scene; empty if there is none."""
-    feed, state = simulator.feeds.get(SCORE), simulator.session.state
+    feed, state = sources.feeds.get(SCORE), sources.session.state
     packet = feed.get_newest() if feed is not None else None
     is_other = packet is not None and state.is_there and packet.header["scene"] != state.scene
     return {} if packet is None or is_other else packet.header

@@ -17,7 +17,7 @@ from us_sim.errors import UsSimError
 from us_sim.viewer.access import AccessControl, is_loopback
 
 if TYPE_CHECKING:  # `us_sim.run.plan` asks for a free port where there is no rclpy
-    from us_sim.viewer.stream import Simulator
+    from us_sim.viewer.stream import PageSources
 
 
 def require_free_address(host: str, port: int) -> None:
@@ -63,7 +63,7 @@ class WebServer:
     """Serves the page, in a thread of its own, until it is closed.
 
     Args:
-        simulator: what the page shows.
+        sources: what the page shows.
         host: address to listen at; other computers need a token.
         port: of TCP; 0 takes any free one.
         token: the token; "" makes a new one.
@@ -74,10 +74,10 @@ class WebServer:
     """
 
     def __init__(
-        self, simulator: Simulator, host: str = "127.0.0.1", port: int = 8080, token: str = ""
+        self, sources: PageSources, host: str = "127.0.0.1", port: int = 8080, token: str = ""
     ) -> None:
         self.token = "" if is_loopback(host) else _check_token(token) or secrets.token_urlsafe(16)
-        self._uvicorn, application = _import_server(simulator)
+        self._uvicorn, application = _import_server(sources)
         self._socket = open_socket(host, port)
         self.host, self.port = host, int(self._socket.getsockname()[1])
         config = self._uvicorn.Config(
@@ -134,7 +134,7 @@ def _find_own_address() -> list[str]:
         return [str(asking.getsockname()[0])]
 
 
-def _import_server(simulator: Simulator) -> tuple[Any, Any]:
+def _import_server(sources: PageSources) -> tuple[Any, Any]:
     """Return the module uvicorn, and the application; raise UsSimError if a package is missing."""
     # NiceGUI would make a folder of its own in the working directory.
     os.environ.setdefault("NICEGUI_STORAGE_PATH", str(cache_folder() / "viewer"))
@@ -146,7 +146,7 @@ def _import_server(simulator: Simulator) -> tuple[Any, Any]:
         raise UsSimError(
             f"the viewer needs {error.name}: install it with `pip install 'us_sim[viewer]'`"
         ) from error
-    return uvicorn, make_application(simulator)
+    return uvicorn, make_application(sources)
 
 
 def _check_token(token: str) -> str:

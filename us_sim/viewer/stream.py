@@ -142,8 +142,8 @@ class Feed:
 
 
 @dataclass
-class Simulator:
-    """The simulator as pages see it; the node ``viewer``, or a test, fills it."""
+class PageSources:
+    """What pages show, and the commands they give; the node ``viewer``, or a test, fills it."""
 
     feeds: dict[str, Feed] = field(default_factory=dict)  # by kind
     commands: dict[str, Callable[[Any, int], str | None]] = field(default_factory=dict)
@@ -178,17 +178,17 @@ class PageStream:
     the newest packet as soon as it is ready: a slow page gets fewer packets, not older ones.
 
     Args:
-        simulator: has the feeds and takes the commands.
+        sources: has the feeds and takes the commands.
         wake: called, in any thread, when a packet may be due.
         only_watches: refuse the page's commands.
     """
 
     def __init__(
-        self, simulator: Simulator, wake: Callable[[], None], *, only_watches: bool = False
+        self, sources: PageSources, wake: Callable[[], None], *, only_watches: bool = False
     ) -> None:
         self.number = next(_numbers)
         self._only_watches = only_watches
-        self._simulator, self._wake = simulator, wake
+        self._sources, self._wake = sources, wake
         self._watched: dict[str, Feed] = {}
         self._ready: set[str] = set()
         self._sent: dict[str, int] = {}
@@ -214,8 +214,8 @@ class PageStream:
         elif key == "next" and isinstance(value, str):
             self._ready.add(value)
             self._wake()
-        elif key in self._simulator.commands:
-            command = self._simulator.commands[key]
+        elif key in self._sources.commands:
+            command = self._sources.commands[key]
             return ONLY_WATCHES if self._only_watches else command(value, self.number)
         else:
             return f"the page sent {key!r}, which the viewer does not know: load the page again"
@@ -226,7 +226,7 @@ class PageStream:
         for kind in self._watched.keys() - set(kinds):
             self._watched.pop(kind).remove_watcher(self._wake)
         for kind in kinds:
-            feed = self._simulator.feeds.get(kind)
+            feed = self._sources.feeds.get(kind)
             if feed is not None and kind not in self._watched:
                 self._watched[kind] = feed
                 self._ready.add(kind)

@@ -28,7 +28,7 @@ from us_sim.viewer.score import connect_scorer
 from us_sim.viewer.server import WebServer
 from us_sim.viewer.session import CONTROL, ViewerSession
 from us_sim.viewer.status import StatusListener
-from us_sim.viewer.stream import CallPoster, Simulator
+from us_sim.viewer.stream import CallPoster, PageSources
 
 _IMAGED_WITH = ("gain", "dynamic_range", "focus")
 """Parameters of ``slice_interpolator`` in the header of each image."""
@@ -47,16 +47,16 @@ class Viewer(GuardedNode):
             self, post, folder if settings.recordings else "", is_own=is_loopback(settings.host)
         )
         self._remote = RemoteParameters(self, {CONTROL: self._session.ask_control})
-        self.simulator = Simulator(
+        self.sources = PageSources(
             nodes=self._remote, status=StatusListener(self, post), session=self._session
         )
-        connect_scorer(self, post, self.simulator)
+        connect_scorer(self, post, self.sources)
         rest = RestMeshListener(self)
-        self._hand = ViewerHand(self, post, self.simulator, rest)
+        self._hand = ViewerHand(self, post, self.sources, rest)
         self._probe = ProbeFeeds(self, post, settings.rate)
         structures = StructuresFeed(self, post, rest)
         self._session.on_other_scene = structures.forget_structures
-        self.simulator.add_feeds(
+        self.sources.add_feeds(
             *make_image_feeds(self, post, settings.rate, self._describe, self._read_arrangement),
             *SkinFeeds(self, post, settings.rate).feeds,
             *self._probe.feeds,
@@ -64,7 +64,7 @@ class Viewer(GuardedNode):
             structures.feed,
         )
         self._server = WebServer(
-            self.simulator, settings.host, settings.port, os.environ.get(TOKEN, "")
+            self.sources, settings.host, settings.port, os.environ.get(TOKEN, "")
         )
         self.health.state = "serving"
         self.health.values = {"port": str(self._server.port)}

@@ -23,7 +23,7 @@ from us_sim.viewer.panels.controls import WhileShown
 from us_sim.viewer.panels.session import ask_confirmation, ask_to_load
 from us_sim.viewer.parameters import format_name
 from us_sim.viewer.score import PICTURE, SCORE, get_score, is_blind
-from us_sim.viewer.stream import Feed, Simulator
+from us_sim.viewer.stream import Feed, PageSources
 
 EVERY_S = 0.5  # between two refreshes of the panel
 ANSWER_S = 30.0  # for a picture: one of an hour takes seconds, on a busy computer more
@@ -46,9 +46,9 @@ class Hints(Element, component="hints.js"):
 class ExercisePanel:
     """The panel of exercises; all pages show the same, so that a teacher sees the learner's."""
 
-    def __init__(self, simulator: Simulator) -> None:
-        self._simulator, self._board = simulator, simulator.session
-        self._scorer = simulator.nodes.get_node(_SCORER)
+    def __init__(self, sources: PageSources) -> None:
+        self._sources, self._board = sources, sources.session
+        self._scorer = sources.nodes.get_node(_SCORER)
         self._only_watches = bool(find_refusal())
         self._watched: list[Feed] = []
         self._score: Mapping[str, Any] | None = None  # that is shown
@@ -83,7 +83,7 @@ class ExercisePanel:
                 self._metrics = ui.grid(columns=2).classes("us-metrics")
 
     def _begin(self) -> None:
-        feeds = self._simulator.feeds
+        feeds = self._sources.feeds
         self._watched = [feeds[kind] for kind in (SCORE, PICTURE) if kind in feeds]
         for feed in self._watched:
             feed.add_watcher(self._ignore_packet)
@@ -100,12 +100,12 @@ class ExercisePanel:
         """Do nothing: the panel looks for packets twice a second."""
 
     def _get_picture(self) -> bytes:
-        feed = self._simulator.feeds.get(PICTURE)
+        feed = self._sources.feeds.get(PICTURE)
         packet = feed.get_newest() if feed is not None else None
         return packet.payload if packet is not None else b""
 
     def _refresh(self) -> None:
-        score = get_score(self._simulator)
+        score = get_score(self._sources)
         if score != self._score:
             self._score = score
             self._show(score)
@@ -134,7 +134,7 @@ class ExercisePanel:
                 enable_control(button, state.is_there and not state.is_busy)
 
     async def _load(self, exercise: ListedScene) -> None:
-        if await ask_to_load(self._simulator, exercise):
+        if await ask_to_load(self._sources, exercise):
             self._choice.close()
 
     def _show(self, score: Mapping[str, Any]) -> None:
@@ -229,15 +229,15 @@ class ExercisePanel:
             origin = self._board.state.origin.partition("#")[0]
             notify_refusal(await ask_session(self._board, scene=origin))
         else:
-            self._simulator.ask_scorer("clear")
+            self._sources.ask_scorer("clear")
 
     async def _draw(self) -> bool:
         """Have the scorer draw the picture anew; return whether it did."""
         if notify_refusal(find_refusal()):
             return False
-        feed = self._simulator.feeds[PICTURE]
+        feed = self._sources.feeds[PICTURE]
         before = feed.sequence
-        self._simulator.ask_scorer("draw")
+        self._sources.ask_scorer("draw")
         for _ in range(int(ANSWER_S / 0.1)):
             if feed.sequence > before:
                 return bool(self._get_picture())
@@ -256,7 +256,7 @@ class ExercisePanel:
 
         if await self._draw():
             now = datetime.now().strftime("%Y-%m-%d-%H-%M-%S")
-            page = render_page(get_score(self._simulator), self._get_picture())
+            page = render_page(get_score(self._sources), self._get_picture())
             ui.download.content(page, f"us_sim-{now}.html", "text/html")
 
 

@@ -20,7 +20,7 @@ from us_sim.viewer.panels.sections import (
 )
 from us_sim.viewer.parameters import Parameter
 from us_sim.viewer.status import NodeLevel, NodeStatus
-from us_sim.viewer.stream import Simulator
+from us_sim.viewer.stream import PageSources
 
 COMMON = ("depth", "gain", "dynamic_range", "focus", "time_gain", "grey_map", "overlay", "contact")
 """Parameters of ``slice_interpolator`` that come first."""
@@ -32,10 +32,10 @@ RECENT_S = 20.0  # for which the refusal of a setting is shown
 PROBLEM_S = 60.0  # for which the last problem of a node that is well again is shown
 
 
-def build_image(simulator: Simulator) -> None:
+def build_image(sources: PageSources) -> None:
     """Build the panel of the scanner's console."""
     console = "", "slice_interpolator", partial(arrange_parameters, first=COMMON)
-    build_parameters(simulator.nodes, console, special={"time_gain": TimeGainControl})
+    build_parameters(sources.nodes, console, special={"time_gain": TimeGainControl})
 
 
 def arrange_tissue(parameters: Mapping[str, Parameter]) -> list[ParameterSection]:
@@ -54,9 +54,9 @@ def arrange_tissue(parameters: Mapping[str, Parameter]) -> list[ParameterSection
     return arrange_parameters(parameters, choosing=METHOD, ahead=[stiffness, pressure])
 
 
-def build_tissue(simulator: Simulator) -> None:
+def build_tissue(sources: PageSources) -> None:
     """Build the panel of the tissue, with the skin and the tracker."""
-    board = simulator.status
+    board = sources.status
 
     def refresh() -> None:
         notes = _list_notes(board.find_node(TISSUE, time.monotonic()))
@@ -71,7 +71,7 @@ def build_tissue(simulator: Simulator) -> None:
             ui.label().classes("us-reason").props('role="alert"'),
         )
     build_parameters(
-        simulator.nodes,
+        sources.nodes,
         ("", TISSUE, arrange_tissue),
         ("Skin", "skin_deformer", arrange_parameters),
         ("Tracker", "probe_tracker", partial(arrange_parameters, choosing=("filter",))),
@@ -96,19 +96,19 @@ def _list_notes(status: NodeStatus | None) -> tuple[str, str, str]:
     )
 
 
-def build_status(simulator: Simulator) -> None:
+def build_status(sources: PageSources) -> None:
     """Build the table of all nodes; a click on one shows its parameters."""
-    board = simulator.status
+    board = sources.status
 
     def refresh() -> None:
         now = time.monotonic()
         table.show_nodes(board.list_nodes(now), now)
 
     with WhileShown(board.add_page, board.remove_page, STATUS_S, refresh):
-        table = StatusTable(partial(_show_parameters, simulator))
+        table = StatusTable(partial(_show_parameters, sources))
 
 
-def _show_parameters(simulator: Simulator, node: str) -> None:
+def _show_parameters(sources: PageSources, node: str) -> None:
     """Open a dialog with all parameters of a node."""
     with ui.dialog() as dialog, ui.card().classes("us-dialog"):
         dialog.props["aria-label"] = f"Parameters of {node}"
@@ -117,7 +117,7 @@ def _show_parameters(simulator: Simulator, node: str) -> None:
             ui.space()
             button = ui.button(icon="close", on_click=dialog.close)
             button.props("flat round dense title=Close aria-label=Close")
-        shown = build_parameters(simulator.nodes, ("", node, arrange_parameters))
+        shown = build_parameters(sources.nodes, ("", node, arrange_parameters))
 
     def close() -> None:
         shown.stop_showing()

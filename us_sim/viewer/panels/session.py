@@ -15,7 +15,7 @@ from us_sim.viewer.panels.asking import ask_session, enable_control, notify_refu
 from us_sim.viewer.panels.controls import WhileShown
 from us_sim.viewer.score import get_score
 from us_sim.viewer.session import NOT_THERE, SessionState
-from us_sim.viewer.stream import Simulator
+from us_sim.viewer.stream import PageSources
 
 AGAIN = "Ends the scene that runs, and starts it anew, without what was set in it"
 ANOTHER = "Ends the scene that runs, and starts this one, without what was set in that"
@@ -26,8 +26,8 @@ BY_HAND = ("", "pose")  # trackers of the main scenes; others differ from these 
 class CasesPanel:
     """The panel of scenes and cases to load."""
 
-    def __init__(self, simulator: Simulator) -> None:
-        self._simulator, self._board = simulator, simulator.session
+    def __init__(self, sources: PageSources) -> None:
+        self._sources, self._board = sources, sources.session
         self._shown: tuple[object, ...] = ()
         with WhileShown(self._board.add_page, self._board.remove_page, EVERY_S, self._refresh):
             self._state = ui.label().classes("us-session-state").props('role="status"')
@@ -90,25 +90,25 @@ class CasesPanel:
             with ui.row().classes("us-case-foot"):
                 ui.label("loaded" if is_loaded else "").classes("us-accent")
                 label = "Load again" if is_loaded else "Load"
-                button = ui.button(label, on_click=lambda: ask_to_load(self._simulator, scene))
+                button = ui.button(label, on_click=lambda: ask_to_load(self._sources, scene))
                 button.props("flat dense no-caps").props["aria-label"] = f"{label} {scene.name}"
                 button.props["title"] = AGAIN if is_loaded else ANOTHER
                 enable_control(button, state.is_there and not state.is_busy and not scene.problem)
 
 
-async def ask_to_load(simulator: Simulator, scene: ListedScene) -> bool:
+async def ask_to_load(sources: PageSources, scene: ListedScene) -> bool:
     """Load a scene, if the person agrees to what ends with the present one.
 
     Returns:
         whether the scene is being loaded.
     """
-    record, score = simulator.session.state.record, get_score(simulator)
+    record, score = sources.session.state.record, get_score(sources)
     ends = [f"the recording {record}, which is kept as it is"] if record else []
     ends += [f"the attempt at {score['name']}"] if score.get("state") == "running" else []
     sentence = f"Loading {scene.name} ends {', and '.join(ends)}."
     if ends and not await ask_confirmation("Load", sentence):
         return False
-    return not notify_refusal(await ask_session(simulator.session, scene=scene.origin))
+    return not notify_refusal(await ask_session(sources.session, scene=scene.origin))
 
 
 async def ask_confirmation(what: str, sentence: str) -> bool:
@@ -141,8 +141,8 @@ KINDS_TOLD = (
 class SessionPanel:
     """The panel that records, and replays recordings."""
 
-    def __init__(self, simulator: Simulator) -> None:
-        self._board = simulator.session
+    def __init__(self, sources: PageSources) -> None:
+        self._board = sources.session
         self._sought: float | None = None  # s, time that a person seeks, until the replay is there
         self._is_pointing = False
         self._asking = 0  # requests without an answer
