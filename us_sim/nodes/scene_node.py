@@ -34,7 +34,7 @@ NO_SENDER = "nobody publishes tracker/pose any more"
 
 
 def explain_missing_poses(node: GuardedNode) -> str:
-    """Return why poses are missing without a fault of a tracker, as at a path's end, or nothing."""
+    """Return why no poses come although no tracker has failed; "" if a tracker must have."""
     name = node.resolve_topic_name(LEAD_TOPIC)
     listeners = [info.node_name for info in node.get_subscriptions_info_by_topic(name)]
     if "probe_tracker" not in listeners or node.count_publishers(name):

@@ -39,7 +39,7 @@ REMEMBERED = 256  # poses kept for the deformed nodes that carry their stamps
 SKINS_REMEMBERED = 64
 
 
-def _together(values: dict[str, Any]) -> tuple[Probe, Imaging, Acoustics]:
+def _collect_console(values: dict[str, Any]) -> tuple[Probe, Imaging, Acoustics]:
     tissues = {
         key.removeprefix(TISSUE_PARAMETERS)[:-1]: value
         for key, value in values.items()
@@ -63,7 +63,7 @@ class SliceInterpolator(SceneNode):
         super().__init__("slice_interpolator", **kwargs)
         # Before the volume, which may take a minute to make.
         console = self._declare_console()
-        probe, imaging, acoustics = _together(console.values)
+        probe, imaging, acoustics = _collect_console(console.values)
         volume = load_volume(self.scene)
         self._scanner = build_scanner(self.scene, volume, threads=self.threads)
         self.get_logger().info(f"preparing {self.scene.slice.name} on {self.scene.volume.name}")
@@ -104,8 +104,8 @@ class SliceInterpolator(SceneNode):
             self,
             {"probe": probe, "imaging": imaging, "acoustics.": imaging.acoustics}
             | {f"{TISSUE_PARAMETERS}{label}.": tissue for label, tissue in tissues},
-            check=lambda to: self._prepare(*_together(to)),
-            use=lambda to: self._apply_settings(*_together(to)),
+            check=lambda to: self._prepare(*_collect_console(to)),
+            use=lambda to: self._apply_settings(*_collect_console(to)),
             names={
                 "probe": [name for name in rules_of(type(probe)) if is_live(type(probe), name)],
                 "imaging": rules_of(Imaging),

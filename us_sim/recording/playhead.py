@@ -35,7 +35,7 @@ class Playhead:
         return now - round(self.compute_position(now) / self.rate)
 
     def go_to(self, position: int, now: int) -> None:
-        """Be there at that time."""
+        """Jump to a position (ns of the recording) at a time of the clock."""
         self._at, self._since = position, now
 
     def set_rate(self, rate: float, now: int) -> None:
@@ -44,7 +44,7 @@ class Playhead:
         self.rate = rate
 
     def set_held(self, is_held: bool, now: int) -> None:
-        """Stay there, or go on from there; nothing happens where that is so already."""
+        """Hold the playhead, or let it go on; do nothing if it is so already."""
         if is_held != self.is_paused:
             self.go_to(self.compute_position(now), now)
             self.is_paused = is_held

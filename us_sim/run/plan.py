@@ -169,14 +169,14 @@ def make_plan(request: RunRequest) -> Plan:
     scene, given = request.scene, dict(request.parameters)
     played = "" if request.path is None else str(full_path(request.path))
 
-    def taken(node: str) -> dict[str, object]:
+    def pop_parameters(node: str) -> dict[str, object]:
         return check_parameters(node, scene, given.pop(node, {}))
 
     processes = []
     if request.view is not None:  # it goes first: a page can load while tissue is built
-        processes.append(plan_viewer(request.view, taken(VIEWER)))
-    recorder = taken(RECORDER) if request.record is not None or request.is_changed else {}
-    player = taken("path_player") if played or request.is_changed else {}
+        processes.append(plan_viewer(request.view, pop_parameters(VIEWER)))
+    recorder = pop_parameters(RECORDER) if request.record is not None or request.is_changed else {}
+    player = pop_parameters("path_player") if played or request.is_changed else {}
     if played and request.everything:
         running = ["diagnostics", "session/scenes", "session/bags"]
         running += [f"/{name}" for name in running]  # of a session without namespace
@@ -190,12 +190,12 @@ def make_plan(request: RunRequest) -> Plan:
         recorder = {"file": str(full_path(request.record)), **common, **source, **recorder}
         processes.append(NodeProcess(RECORDER, recorder))
     needed = [part.node for part in scene.list_parts() if part.needed]
-    own: dict[str, dict[str, object]] = {}
+    own: dict[str, dict[str, object]] = {node: {} for node in needed}
     if played or request.by_hand:
         own["probe_tracker"] = {"source": "pose"}
     if request.results:
         own["scorer"] = {"student": request.student, "results": request.results}
-    processes += [NodeProcess(node, common | own.get(node, {}) | taken(node)) for node in needed]
+    processes += [NodeProcess(node, common | own[node] | pop_parameters(node)) for node in needed]
     if given:
         raise UsSimError(
             f"--param {next(iter(given))}: this scene does not run such a node; it runs "

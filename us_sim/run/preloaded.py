@@ -14,7 +14,7 @@ _SHARED = ("scipy.sparse", "us_sim.nodes.messages", "us_sim.nodes.settings")
 
 
 def import_shared() -> None:
-    """Import it, as a process that ends with the one that started it."""
+    """Import the modules that node processes share, and end with the parent process."""
     end_with_parent(signal.SIGKILL)
     with contextlib.suppress(ImportError):  # it works without a name in `ps`
         from setproctitle import setproctitle

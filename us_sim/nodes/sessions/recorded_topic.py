@@ -47,10 +47,10 @@ class RecordedTopic:
         self._node, self._type = node, message_type(type_name)
         self._take, self._lost = take, lost
         self._offered = dict.fromkeys(offered)
-        self._adopted = _adopted(self._offered)
+        self._adopted = _choose_qos(self._offered)
         self._publishers = len(offered)
         self._sequence: int | None = None
-        self._subscription = self._subscribed()
+        self._subscription = self._subscribe()
 
     @property
     def is_latched(self) -> bool:
@@ -63,12 +63,12 @@ class RecordedTopic:
             self._publishers, self._sequence = len(offered), None
         new = [profile for profile in dict.fromkeys(offered) if profile not in self._offered]
         self._offered |= dict.fromkeys(new)
-        adopted = _adopted(self._offered)
+        adopted = _choose_qos(self._offered)
         if adopted != self._adopted:
             self.take_remaining()
             self._node.destroy_subscription(self._subscription)
             self._adopted, self._sequence = adopted, None
-            self._subscription = self._subscribed()
+            self._subscription = self._subscribe()
         return new
 
     def take_remaining(self) -> None:
@@ -78,7 +78,7 @@ class RecordedTopic:
             while taken := handle.take_message(self._type, True):
                 self._receive(*taken)
 
-    def _subscribed(self) -> Subscription:
+    def _subscribe(self) -> Subscription:
         events = SubscriptionEventCallbacks(message_lost=self._count_lost)
         return self._node.create_subscription(
             self._type,
@@ -120,7 +120,7 @@ class RecordedTopic:
             self._lost(self.name, status.total_count_change)
 
 
-def _adopted(offered: Iterable[Qos]) -> QoSProfile:
+def _choose_qos(offered: Iterable[Qos]) -> QoSProfile:
     """Choose the quality of service that every publisher can serve, as rosbag2 does."""
     offered = list(offered)
     reliable = all(q.reliability == QosReliability.RELIABLE for q in offered)
