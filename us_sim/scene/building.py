@@ -26,9 +26,8 @@ from us_sim.errors import BagError, ProbeError, SceneError, TrackingError, UsSim
 from us_sim.geometry.pose import Placement, Pose
 from us_sim.scene.scene import Scene, TissueSettings
 from us_sim.settings.registry import COLLIDERS, PROBES, TRACKERS
-from us_sim.slicing.acoustics.settings import AROUND
 from us_sim.tracking.measurement import PATIENT
-from us_sim.volume.structure_names import Colour, choose_colour
+from us_sim.volume.structure_names import AROUND, Colour, choose_colour
 
 if TYPE_CHECKING:
     from us_sim.geometry.collider import Collider

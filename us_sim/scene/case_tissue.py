@@ -31,7 +31,8 @@ from us_sim.tissue.elasticity.materials import LabelFractions, label_fractions
 from us_sim.tissue.mesh.box_planes import fit_planes, spacing_by_labels, spacing_under_probe
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.volume.cases.case import LABELS, Case, read_case
-from us_sim.volume.cases.settings import AROUND, SLIDE, CaseSettings
+from us_sim.volume.cases.settings import SLIDE, CaseSettings
+from us_sim.volume.structure_names import AROUND
 from us_sim.volume.volume import Volume, compute_grid_extent
 
 _BESIDE = 0.013  # m, of tissue beside the probe

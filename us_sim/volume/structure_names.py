@@ -14,6 +14,7 @@ from functools import cache
 from us_sim.share import shared_path
 from us_sim.tissue.elasticity.material import guess_tissue_kind
 
+AROUND = "tissue"  # name of what is in no structure: label 0, or all of a volume without labels
 _PHRASES = re.compile(r"\b(?:gr[ae]y|white) (?=matter\b)")
 
 _NUMERAL = re.compile(r"\d{1,2}|[ivx]{1,4}[ab]?|[a-d]|[lctsr]\d{1,2}")

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from us_sim.errors import ProbeError
 from us_sim.settings.spelling import describe_unknown
 from us_sim.slicing.acoustics.path_loss import NOTHING, Media
-from us_sim.slicing.acoustics.settings import AROUND, Acoustics, TissueAcoustics
+from us_sim.slicing.acoustics.settings import Acoustics, TissueAcoustics
 from us_sim.slicing.acoustics.surface_echo import MIRROR
 from us_sim.slicing.probe.probe import LinearProbe, Probe
+from us_sim.volume.structure_names import AROUND
 from us_sim.volume.volume import Volume
 
 _SOFT = (0.8e6, 3.0e6)

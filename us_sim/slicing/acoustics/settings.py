@@ -12,8 +12,7 @@ from typing import Any
 from us_sim.errors import ProbeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-
-AROUND = "tissue"  # the name of what is in no structure
+from us_sim.volume.structure_names import AROUND
 
 # dB/cm/MHz and Rayl, by words of a label's name.
 # Szabo, Diagnostic Ultrasound Imaging: Inside Out (2nd ed., 2014), Appendix B, table B.1.

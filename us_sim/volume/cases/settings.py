@@ -12,9 +12,7 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import describe_unknown, short_repr
 from us_sim.tissue.elasticity.material import KINDS, Material, guess_tissue_kind
-from us_sim.volume.structure_names import Colour, choose_colour
-
-AROUND = "tissue"  # name of what is in no structure: label 0, or all of a volume without labels
+from us_sim.volume.structure_names import AROUND, Colour, choose_colour
 
 SLIDE = 8e-3  # m, that the proposed path slides and comes back where nothing else is said
 
