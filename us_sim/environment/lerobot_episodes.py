@@ -25,6 +25,7 @@ from us_sim.recording.lerobot_writer import (
     IMAGES,
     POSE_PARTS,
     STATE,
+    TWIST_PARTS,
     WRENCH_PARTS,
     Frame,
     LeRobotEpisode,
@@ -32,7 +33,6 @@ from us_sim.recording.lerobot_writer import (
 )
 
 _PARTS = {"pose": POSE_PARTS, "goal": POSE_PARTS, "wrench": WRENCH_PARTS, "contact": ("contact",)}
-_ACTION = ("x", "y", "z", "rx", "ry", "rz")  # of the probe's velocity in its frame, -1 to 1
 _USED = ("image.png", "labels.png", "json")
 _Step = Mapping[str, Any]  # files by their endings; of "json", the object
 
@@ -116,7 +116,7 @@ def _name_numbers(step: _Step, facts: Mapping[str, Any]) -> dict[str, Sequence[s
     state = [f"{name}.{part}" for name in sorted(record["observed"]) for part in _PARTS[name]]
     return {
         STATE: state,
-        "action": _ACTION,
+        "action": TWIST_PARTS,  # of the probe's velocity in its frame, -1 to 1
         "truth.pose": POSE_PARTS,
         "truth.wrench": WRENCH_PARTS,
         "truth.areas": sorted(record.get("areas", ())),

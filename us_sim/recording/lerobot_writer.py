@@ -25,6 +25,7 @@ IMAGES = "observation.images."
 STATE = "observation.state"
 POSE_PARTS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 WRENCH_PARTS = ("fx", "fy", "fz", "tx", "ty", "tz")
+TWIST_PARTS = ("x", "y", "z", "rx", "ry", "rz")
 _REMEDY = "pip install 'lerobot[dataset]>=0.4'"
 _THREADS = 2  # that compress images
 

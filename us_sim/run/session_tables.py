@@ -18,12 +18,13 @@ import pandas as pd
 from us_sim import Progress
 from us_sim.errors import BagError
 from us_sim.recording.attached_files import new_file
-from us_sim.recording.lerobot_writer import POSE_PARTS, WRENCH_PARTS
+from us_sim.recording.lerobot_writer import POSE_PARTS, TWIST_PARTS, WRENCH_PARTS
 from us_sim.recording.path import POSE_STAMPED, list_bodies, read_pose_rows
 from us_sim.recording.reader import Bag
 
 SECOND = 1_000_000_000  # ns
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
+_TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 _LARGEST = 2**63 - 1
 _COLUMNS = ("stamp", "logged", "sent", "number", "size", "is_short")
 
@@ -83,9 +84,7 @@ def _numbers(names: tuple[str, ...], linear: Any, angular: Any) -> dict[str, flo
 
 VALUES: Mapping[str, Callable[[Any], dict[str, float]]] = {
     WRENCH_STAMPED: lambda m: _numbers(WRENCH_PARTS, m.wrench.force, m.wrench.torque),
-    "geometry_msgs/msg/TwistStamped": lambda m: _numbers(
-        ("x", "y", "z", "rx", "ry", "rz"), m.twist.linear, m.twist.angular
-    ),
+    _TWIST_STAMPED: lambda m: _numbers(TWIST_PARTS, m.twist.linear, m.twist.angular),
     "sensor_msgs/msg/JointState": lambda m: dict(zip(m.name, m.position.tolist(), strict=False)),
 }
 """The numbers in messages of these types, which are no poses."""
