@@ -12,8 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from us_sim.errors import BagError
+from us_sim.recording.decoding import SECOND
 from us_sim.run.session_summary import IMAGE, Session
-from us_sim.run.session_tables import SECOND
 from us_sim.scene.building import build_probe
 from us_sim.scene.scene import Scene
 from us_sim.scoring.metrics import VesselSection

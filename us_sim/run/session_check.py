@@ -16,9 +16,10 @@ from us_sim import Progress
 from us_sim.errors import printable_line
 from us_sim.nodes.settings import AnnotatedImageSettings
 from us_sim.nodes.topics import TOPICS
+from us_sim.recording.decoding import SECOND
 from us_sim.recording.reader import Bag
 from us_sim.recording.topic import BagTopic
-from us_sim.run.session_tables import SECOND, read_times
+from us_sim.run.session_tables import read_times
 from us_sim.settings.spelling import align_columns, format_count
 
 POSES = "probe/pose"

@@ -15,12 +15,11 @@ from PIL import Image
 from us_sim import Progress
 from us_sim.errors import BagError, TrackingError
 from us_sim.recording.attached_files import new_file
-from us_sim.recording.decoding import affine_from
+from us_sim.recording.decoding import SECOND, affine_from
 from us_sim.recording.reader import Bag
 from us_sim.run.session_lerobot import PIXELS
 from us_sim.run.session_summary import read_session, unpack_scene
 from us_sim.run.session_tables import (
-    SECOND,
     WRENCH_STAMPED,
     list_pose_sources,
     list_topics,

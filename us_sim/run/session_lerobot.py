@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from us_sim import Progress
 from us_sim.errors import BagError, TrackingError
+from us_sim.recording.decoding import SECOND
 from us_sim.recording.lerobot_writer import (
     IMAGES,
     STATE,
@@ -30,7 +31,6 @@ from us_sim.recording.lerobot_writer import (
 from us_sim.recording.path import are_poses, find_whole_name
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.run.session_tables import (
-    SECOND,
     VALUES,
     list_pose_sources,
     list_topics,

@@ -9,10 +9,11 @@ import numpy as np
 
 from us_sim import Progress
 from us_sim.errors import BagError, ScoreError, UsSimError
+from us_sim.recording.decoding import SECOND
 from us_sim.recording.path import POSE_STAMPED, ProbePath, is_tracker_recording, read_path
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.run.session_summary import POSE, read_session, unpack_scene
-from us_sim.run.session_tables import SECOND, WRENCH_STAMPED, list_topics, read_wrenches
+from us_sim.run.session_tables import WRENCH_STAMPED, list_topics, read_wrenches
 from us_sim.scene.building import load_volume
 from us_sim.scoring.lumen import find_vessels
 from us_sim.scoring.metrics import Force, Scan

@@ -17,9 +17,9 @@ from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.sessions.attachments import file_checksum
 from us_sim.recording.attached_files import extract_files
-from us_sim.recording.decoding import pixels_from, pose_from, tetrahedra_from, vectors_from
+from us_sim.recording.decoding import SECOND, pixels_from, pose_from, tetrahedra_from, vectors_from
 from us_sim.recording.reader import Bag, read_bag
-from us_sim.run.session_tables import SECOND, read_times
+from us_sim.run.session_tables import read_times
 from us_sim.scene.building import build_scanner, load_volume
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene

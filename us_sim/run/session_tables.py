@@ -18,11 +18,11 @@ import pandas as pd
 from us_sim import Progress
 from us_sim.errors import BagError
 from us_sim.recording.attached_files import new_file
+from us_sim.recording.decoding import SECOND
 from us_sim.recording.lerobot_writer import POSE_PARTS, TWIST_PARTS, WRENCH_PARTS
 from us_sim.recording.path import POSE_STAMPED, list_bodies, read_pose_rows
 from us_sim.recording.reader import Bag
 
-SECOND = 1_000_000_000  # ns
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
 _TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 _LARGEST = 2**63 - 1
