@@ -124,10 +124,8 @@ def test_a_step_says_where_it_is_to_be_done(bench, small_scene, tmp_path):
     file = tmp_path / "two.yaml"
     file.write_text("name: c\ntask: {kind: compression, points: [1 cm]}\n")
     node = bench.make(Scorer, scene=str(small_scene), exercise=str(file))
-    poses = bench.publisher(PoseStamped, "probe/pose")
     scores = bench.collect(DiagnosticArray, "score", latched=True)
-    for second in (1, 2):
-        poses.publish(pose_at(0.0, second))
+    press(bench, 0.0, 2)
     bench.spin_until(lambda: bool(scores))
     step = scores[-1].status[1]
     assert step.level == DiagnosticStatus.WARN
@@ -293,12 +291,45 @@ def test_a_setting_that_is_changed_meanwhile_stands_in_the_result(bench):
         events.publish(ParameterEvent(stamp=stamp, node=f"/{name}", changed_parameters=[gain]))
     bench.spin_until(lambda: bool(scores) and told(scores[-1], "about")["changed"] != "")
     assert told(scores[-1], "about")["changed"] == "slice_interpolator.gain = 3.0 at 4 s"
+    assert ask(bench, "clear")
+    scores.clear()
+    press(bench, 5.0)
+    bench.spin_until(lambda: bool(scores))
+    assert told(scores[-1], "about")["changed"] == "slice_interpolator.gain = 3.0 before"
+
+
+@pytest.mark.usefixtures("node")
+def test_who_moves_the_probe_stands_in_the_result(bench):
+    bench.peer.create_publisher(PoseStamped, "tracker/pose", 1)
+    scores = bench.collect(DiagnosticArray, "score", latched=True)
+    press(bench, 5.0)
+    bench.spin_until(lambda: bool(scores))
+    bench.spin_until(lambda: told(scores[-1], "about")["moved by"] == "bench")
+
+
+@pytest.mark.usefixtures("node")
+def test_an_attempt_does_not_begin_before_the_tissue_answers(bench):
+    scores = bench.collect(DiagnosticArray, "score", latched=True)
+    poses = bench.publisher(PoseStamped, "probe/pose")
+    for second in range(100):
+        poses.publish(pose_at(0.0, second + 1, x=0.01 * second))
+    bench.spin_for(30)
+    assert not scores or told(scores[-1], "plain")["Time, s"] == "-"
+
+
+def test_nobody_answers_before_the_first_touch(bench, examination):
+    press(bench, 0.0)
+    bench.spin_for(20)
+    refused = examination.set_parameters([Parameter("answers", value=["compressible"])])[0]
+    assert not refused.successful
+    assert "first touch" in refused.reason
 
 
 def test_answers_go_to_their_points_in_any_order(bench, examination):
     node = examination
     scores = bench.collect(DiagnosticArray, "score", latched=True)
     press(bench, 5.0)
+    bench.spin_until(lambda: bool(scores))
     answers = Parameter("answers", value=["-", "not seen"])
     assert node.set_parameters([answers])[0].successful
     bench.spin_until(lambda: bool(scores) and "not seen" in statuses(scores[-1], "step")[1].message)

@@ -25,7 +25,7 @@ from us_sim.nodes.guarded_node import keep_newest, status_message
 from us_sim.nodes.parameters import LiveSettings, declare_settings
 from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import EVERY
-from us_sim.nodes.scene_node import SceneNode
+from us_sim.nodes.scene_node import LEAD_TOPIC, SceneNode
 from us_sim.nodes.settings import ScorerSettings
 from us_sim.recording.decoding import nanoseconds_of, pixels_from, pose_from, wrench_from
 from us_sim.scene.building import build_scanner, load_volume
@@ -74,6 +74,8 @@ class Scorer(SceneNode):
         self._place = ResultPlace(results) if results else None
         self._void = "the scorer was started again: begin anew" if self._settings.begun else ""
         self._is_known = False  # a result has shown the truth about this arm
+        self._is_simulated = self.scene.tissue is None  # the tissue answers, if there is one
+        self._changes: dict[str, str] = {}  # when, by what was set
         self._begin_attempt()
         self._score = self.create_latched_publisher(DiagnosticArray, "score")
         self._picture = self.create_latched_publisher(CompressedImage, "score/picture")
@@ -99,7 +101,8 @@ class Scorer(SceneNode):
         self._is_kept = False  # its picture is drawn and its result written
         self._poses: dict[int, Pose] = {}
         self._begin = self._measured = 0  # ns
-        self._changes: list[str] = []
+        self._changes = dict.fromkeys(self._changes, "before")
+        self._movers: set[str] = set()  # nodes that publish poses
         self._begun = datetime.now().astimezone().isoformat(timespec="seconds")
         self.health.values = {}
 
@@ -110,6 +113,7 @@ class Scorer(SceneNode):
         keep_newest(self._poses, stamp, pose, _REMEMBERED)
 
     def _on_wrench(self, message: WrenchStamped) -> None:
+        self._is_simulated = True
         if self._begin:
             time, force = self._seconds(nanoseconds_of(message.header.stamp)), wrench_from(message)
             self._live.add_force(time, force[:3])
@@ -139,10 +143,20 @@ class Scorer(SceneNode):
             return
         for changed in message.changed_parameters:
             value = parameter_value_to_python(changed.value)
-            when = f"{self._seconds(nanoseconds_of(message.stamp)):.0f} s" if self._begin else "0 s"
-            self._changes.append(f"{node}.{changed.name} = {value} at {when}")
+            when = (
+                f"at {self._seconds(nanoseconds_of(message.stamp)):.0f} s"
+                if self._begin
+                else "before"
+            )
+            self._changes[f"{node}.{changed.name} = {value}"] = when
 
     def _publish_score(self) -> None:
+        if not self._is_simulated:  # nobody can press yet
+            self._live.clear()
+            self._begin = 0
+            return
+        movers = self.get_publishers_info_by_topic(self.resolve_topic_name(LEAD_TOPIC))
+        self._movers.update(each.node_name for each in movers)
         is_wanted = self._score.get_subscription_count() > 0
         if not is_wanted and self._place is None:
             return
@@ -183,7 +197,8 @@ class Scorer(SceneNode):
             "scene": self.scene.name,
             "volume": self.scene.volume.name,
             "method": tissue.solver if tissue is not None else "none",
-            "changed": "; ".join(self._changes),
+            "moved by": ", ".join(sorted(self._movers)),
+            "changed": "; ".join(f"{what} {when}" for what, when in self._changes.items()),
             "arm": "known from an attempt before" if self._is_known else "",
             "us_sim": __version__,
         }

@@ -12,6 +12,7 @@ import pandas as pd
 from us_sim.scoring.result import encode_picture
 
 CLASS_FILES = ("class.csv", "class.html")
+_ABOUT = ("volume", "moved by", "changed", "checksum")
 _ALT = "Points right of each attempt, over time, for each student"
 
 
@@ -27,7 +28,7 @@ def tabulate_results(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
             "right": sum(step["state"] == "done" for step in each["steps"]),
             "of": len(each["steps"]),
             "faults": len(each["faults"]),
-            **{key: each["about"].get(key, "") for key in ("volume", "changed", "checksum")},
+            **{key: each["about"].get(key, "") for key in _ABOUT},
         }
         for each in results
     ]
@@ -39,7 +40,7 @@ def write_class_table(table: pd.DataFrame, folder: Path) -> list[Path]:
     files = [folder / name for name in CLASS_FILES]
     folder.mkdir(parents=True, exist_ok=True)
     table.to_csv(files[0], index=False)
-    shown = table.drop(columns=["volume", "checksum"]).fillna("-")
+    shown = table.drop(columns=["volume"]).fillna("-")
     students, exercises = table["student"].nunique(), table["exercise"].nunique()
     passed = (table["result"] == "passed").sum()
     files[1].write_text(

@@ -141,6 +141,8 @@ class _Press:
     most: float = 0.0  # N
     closed: tuple[float, float] | None = None  # N, and the part of the artery that was open
     closed_since: float = np.inf  # s
+    hard_since: float = np.inf  # s, with the force that shows a thrombus
+    is_hard: bool = False  # for long enough to see that the vein stays open
 
     def add_look(self, look: _Look) -> None:
         """Add an image of it."""
@@ -149,6 +151,8 @@ class _Press:
             self.least, self.force = look.part, look.force
         is_closed = look.part <= WALLS_TOUCH
         self.closed_since = min(self.closed_since, look.time) if is_closed else np.inf
+        self.hard_since = min(self.hard_since, look.time) if look.force >= _ENOUGH else np.inf
+        self.is_hard |= look.time - self.hard_since >= _LOOKED
         is_better = self.closed is None or self.closed[1] < _OPEN <= look.artery
         if look.time - self.closed_since >= _LOOKED and is_better:
             self.closed = look.force, look.artery
@@ -180,12 +184,10 @@ class _Examination(Attempt):
         numbers = [str(k + 1) for k in range(len(self._points))]
         if not self.is_blind:
             super().set_answers(points, thrombus, time)
-        if self.ended is not None:
-            raise ScoreError("answers: the attempt has ended: begin anew")
+        if self.ended is not None or self.touched is None:
+            raise ScoreError("answers: taken between the first touch and the attempt's end")
         if len(points) > len(numbers) or not {*points} <= {*ANSWERS, NO_ANSWER}:
-            raise ScoreError(
-                f"answers: one of {', '.join(ANSWERS)} or - for each of {len(numbers)} points"
-            )
+            raise ScoreError(f"answers: {', '.join(ANSWERS)} or - for {len(numbers)} points")
         if thrombus not in ("", NO_THROMBUS, *numbers):
             raise ScoreError(f"thrombus: {NO_THROMBUS}, or a point's number, 1 to {len(numbers)}")
         for point, answer in zip(self._points, points, strict=False):
@@ -261,7 +263,7 @@ class _Examination(Attempt):
             seen = f"{seen}: it is {' or '.join(truths)}"
         elif self.ended is not None and not point.is_examined:
             seen = f"{seen}: right, and not examined: {point.seen}"
-        is_right &= point.is_examined
+        is_right = is_right and point.is_examined
         return self._conclude(f"point {number}", is_right, seen, point.place[None])
 
     def _thrombus_step(self) -> Step:
@@ -333,11 +335,9 @@ class _Examination(Attempt):
         if press.has_slid or not look.is_touching or (slid <= _TOLERANCE and turned <= _TURN):
             return
         press.has_slid = True
-        far = (
-            f"slid {_MM * slid:.0f} mm"
-            if slid > _TOLERANCE
-            else f"turned {np.rad2deg(turned):.0f}°"
-        )
+        far = f"turned {np.rad2deg(turned):.0f}°"
+        if slid > _TOLERANCE:
+            far = f"slid {_MM * slid:.0f} mm"
         press.problem = f"{far} under pressure: let go before you move on"
         self.faults.append(Fault(look.time, press.problem))
 
@@ -365,7 +365,7 @@ class _Examination(Attempt):
         if point is None or point.is_done:
             return
         point.most = press.most
-        is_seen = press.closed is not None or press.most >= _ENOUGH
+        is_seen = press.closed is not None or press.is_hard
         point.is_examined |= is_seen and not press.problem
         point.is_done, point.seen = self._judge(press, point)
 
@@ -375,14 +375,13 @@ class _Examination(Attempt):
         if press.problem:
             return False, press.problem
         if press.closed is not None:
-            left = press.closed[1]
-            if left >= _OPEN:
+            if (left := press.closed[1]) >= _OPEN:
                 return True, seen
             return False, f"{seen}, and of the {self._task.artery} {100 * left:.0f} % were left"
         if press.least <= WALLS_TOUCH:
             return False, f"closed{_format_force(press.force)} too shortly to be seen"
-        if press.most < _ENOUGH:
-            return False, f"{seen}: not pressed enough"
+        if not press.is_hard:
+            return False, f"{seen}: not pressed hard and long enough"
         begin, end = self._thrombus
         is_thrombus = begin - _TOLERANCE <= point.at <= end + _TOLERANCE
         return is_thrombus, f"{seen}: {'a thrombus' if is_thrombus else 'not closed'}"

@@ -30,6 +30,7 @@ _Array = NDArray[np.float64]
 _TIME, _FORCE = Quantity("time", 0.1, 3600.0), Quantity("force", 0.01, 200.0)
 _MM = 1e3
 _MOVED = 1e-3  # m, by which a hand has moved the probe
+_SILENT = 1.0  # s without a sample, in which nobody knows whether something was held
 
 
 class Step(NamedTuple):
@@ -195,7 +196,8 @@ class _Holding(Attempt):
     def _hold(self, times: _Array, within: NDArray[np.bool_], duration: float) -> None:
         """Add samples: their times (K,) s, and whether it was held at each."""
         for time, now in zip(times.tolist(), within.tolist(), strict=True):
-            self._held = self._held + time - self._last if now and self._was else 0.0
+            since = time - self._last
+            self._held = self._held + since if now and self._was and since <= _SILENT else 0.0
             self._longest = max(self._longest, self._held)
             if self.ended is None and self._longest >= duration:
                 self.ended = time

@@ -97,8 +97,8 @@ class LiveScan:
         """Set the learner's answers so far, see `Attempt.set_answers`."""
         if self._attempt is None:
             raise ScoreError("answers: no exercise is followed")
-        time = self._pose_times[-1] if self._pose_times else 0.0
-        self._attempt.set_answers(points, thrombus, time)
+        self.compute_score()  # of what has come since
+        self._attempt.set_answers(points, thrombus, max(self._pose_times, default=0.0))
 
     def _is_next(self, times: list[float], time: float) -> bool:
         return time > self._settled and not (times and time <= times[-1])
