@@ -165,7 +165,7 @@ def test_a_point_that_was_missed_or_not_closed_is_not_done():
     soft = attempt(scanned(examination(newtons=(9.0, 5.0, 9.0)))).list_steps()
     assert [step.is_done for step in soft] == [True, False, True]
     assert [step.is_missed for step in soft] == [False, True, False]
-    assert "not pressed enough" in soft[1].seen
+    assert "not pressed hard" in soft[1].seen
 
 
 def test_a_thrombus_is_found_by_pressing_hard_where_it_is():

@@ -185,7 +185,7 @@ class _Examination(Attempt):
         if not self.is_blind:
             super().set_answers(points, thrombus, time)
         if self.ended is not None or self.touched is None:
-            raise ScoreError("answers: taken between the first touch and the attempt's end")
+            raise ScoreError("answers: taken from the first touch until the attempt has ended")
         if len(points) > len(numbers) or not {*points} <= {*ANSWERS, NO_ANSWER}:
             raise ScoreError(f"answers: {', '.join(ANSWERS)} or - for {len(numbers)} points")
         if thrombus not in ("", NO_THROMBUS, *numbers):
