@@ -175,6 +175,22 @@ def test_a_thrombus_is_found_by_pressing_hard_where_it_is():
     assert done(scanned(examination(), clot=CLOT)) == [True, False, True]
 
 
+def test_a_jab_at_a_thrombus_is_too_short_to_show_it():
+    first, at, last = POINTS
+    jab = [
+        (1, at, 0.5),
+        (1, at, 0.5),
+        (0.1, at, 15.0),
+        (0.2, at, 15.0),
+        (0.1, at, 0.5),
+        (1, at, 0.5),
+    ]
+    way = [(0, first, 0.0), (1, first, 0.0), *press(first), *jab, *press(last), (1, last, 0.5)]
+    made = attempt(scanned(way, clot=CLOT)).list_steps()
+    assert [step.is_done for step in made] == [True, False, True]
+    assert "long enough" in made[1].seen
+
+
 def test_the_artery_must_stay_open_when_the_vein_closes():
     assert done(scanned(examination(), artery=0.2)) == [False] * 3
     assert done(scanned(examination(), artery=0.2), artery=None) == [True] * 3
