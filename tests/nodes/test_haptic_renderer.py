@@ -214,6 +214,8 @@ def test_a_hold_up_is_skipped_and_not_made_up_for():
     ways = [b - a for a, b in itertools.pairwise(ticks)]
     # On the whole as many periods passed as there were ticks and skipped ones: nothing drifts.
     assert abs((ticks[59] - ticks[0]) * 1e-9 / period - (59 + thread.skipped)) < 3
-    assert sum(way < 0.2e9 * period for way in ways) <= 3
+    # One tick may follow a late one soon, as on a busy machine; several in a row make up for it.
+    short = [way < 0.2e9 * period for way in ways]
+    assert sum(a and b for a, b in itertools.pairwise(short)) <= 3
     assert 0.0 < thread.jitter < 25 * period
     assert "periodic" not in {each.name for each in threading.enumerate()}
