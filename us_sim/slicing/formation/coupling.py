@@ -380,7 +380,7 @@ _LOSSES = _losses()
 
 def _apertures(probe: Probe) -> NDArray[np.int64]:
     """Return (`_STEPS`,) lengths of face, in places, that form a line at each step of depth."""
-    length = np.linalg.norm(np.diff(probe.beam_starts, axis=0), axis=1).sum()
+    length = float(np.linalg.norm(np.diff(probe.beam_starts, axis=0), axis=1).sum())
     length = max(length * probe.lines / max(probe.lines - 1, 1), 1e-6)
     depth = (np.arange(_STEPS) + 0.5) * (probe.depth / _STEPS)
     least, most = _APERTURE

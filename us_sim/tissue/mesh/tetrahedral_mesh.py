@@ -486,7 +486,7 @@ def repair_mesh(nodes: ArrayLike, tetrahedra: ArrayLike) -> tuple[TetrahedralMes
     if inverted.any():
         corners = corners.astype(np.int32)
         corners[inverted] = corners[inverted][:, [0, 1, 3, 2]]
-        report.append(_format_repair("turned", inverted.sum(), "inverted tetrahedron"))
+        report.append(_format_repair("turned", int(inverted.sum()), "inverted tetrahedron"))
     try:
         return TetrahedralMesh(places, corners.astype(np.int32)), tuple(report)
     except MeshError as error:

@@ -113,7 +113,7 @@ def fit_part(
     for part in (_rectangle(body, pixel), _fan(body, within, pixel)):
         if part is not None:
             inside = part.contains(x, z) & within
-            overlap = float((inside & body).sum() / max(1, (inside | body).sum()))
+            overlap = int((inside & body).sum()) / max(1, int((inside | body).sum()))
             if overlap > least:
                 best, least = part, overlap
     return best
