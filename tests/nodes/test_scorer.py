@@ -307,14 +307,18 @@ def test_who_moves_the_probe_stands_in_the_result(bench):
     bench.spin_until(lambda: told(scores[-1], "about")["moved by"] == "bench")
 
 
-@pytest.mark.usefixtures("node")
-def test_an_attempt_does_not_begin_before_the_tissue_answers(bench):
+def test_an_attempt_does_not_begin_before_the_tissue_answers(bench, node):
     scores = bench.collect(DiagnosticArray, "score", latched=True)
     poses = bench.publisher(PoseStamped, "probe/pose")
     for second in range(100):
         poses.publish(pose_at(0.0, second + 1, x=0.01 * second))
+    bench.spin_until(lambda: node.health.received >= 100)
+    node._publish_score()  # as once a second
     bench.spin_for(30)
-    assert not scores or told(scores[-1], "plain")["Time, s"] == "-"
+    assert not scores
+    press(bench, 5.0)
+    bench.spin_until(lambda: bool(scores) and told(scores[-1], "plain")["Highest force, N"] == "5")
+    assert float(told(scores[-1], "plain")["Time, s"]) < 20
 
 
 def test_nobody_answers_before_the_first_touch(bench, examination):

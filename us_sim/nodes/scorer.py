@@ -74,7 +74,7 @@ class Scorer(SceneNode):
         self._place = ResultPlace(results) if results else None
         self._void = "the scorer was started again: begin anew" if self._settings.begun else ""
         self._is_known = False  # a result has shown the truth about this arm
-        self._is_simulated = self.scene.tissue is None  # the tissue answers, if there is one
+        self._is_tissue_ready = self.scene.tissue is None
         self._changes: dict[str, str] = {}  # when, by what was set
         self._begin_attempt()
         self._score = self.create_latched_publisher(DiagnosticArray, "score")
@@ -113,7 +113,7 @@ class Scorer(SceneNode):
         keep_newest(self._poses, stamp, pose, _REMEMBERED)
 
     def _on_wrench(self, message: WrenchStamped) -> None:
-        self._is_simulated = True
+        self._is_tissue_ready = True
         if self._begin:
             time, force = self._seconds(nanoseconds_of(message.header.stamp)), wrench_from(message)
             self._live.add_force(time, force[:3])
@@ -151,7 +151,7 @@ class Scorer(SceneNode):
             self._changes[f"{node}.{changed.name} = {value}"] = when
 
     def _publish_score(self) -> None:
-        if not self._is_simulated:  # nobody can press yet
+        if not self._is_tissue_ready:  # nobody can press yet
             self._live.clear()
             self._begin = 0
             return

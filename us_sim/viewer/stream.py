@@ -143,7 +143,7 @@ class Feed:
 
 @dataclass
 class PageSources:
-    """What pages show, and the commands they give; the node ``viewer``, or a test, fills it."""
+    """Feeds, commands and boards of all pages; the node ``viewer``, or a test, fills it."""
 
     feeds: dict[str, Feed] = field(default_factory=dict)  # by kind
     commands: dict[str, Callable[[Any, int], str | None]] = field(default_factory=dict)
