@@ -250,6 +250,7 @@ def test_targets_stand_on_the_skin_in_the_colours_of_their_states_and_move_with_
     score.offer_packet(lambda n: Packet("score", n, {"scene": "", "steps": again}, b""))
     scene.page.get_by_text("4: vein: closed").wait_for()
     style.evaluate("style => style.remove()")
+    scene.until("scene.stage.pace.isAtRest")  # the page may have been laid out anew
     numbers = scene.page.locator(".us-number:not(.us-behind)")
     assert numbers.all_inner_texts() == ["1", "2", "3", "4"]
     assert scene.page.locator(".us-behind").inner_text() == "5"
