@@ -100,12 +100,19 @@ def test_a_blind_exercise_hides_the_truth_and_asks(page, sources):
     open_panel(page, scorer)
     scorer.say(steps, feedback="afterwards")
     page.get_by_role("button", name="Show the result").wait_for(state="hidden")
-    page.get_by_role("button", name="point 1: not compressible").click()
+    button = page.get_by_role("button", name="point 1: not compressible")
+    pressed = button.element_handle()
+    scorer.say([{**step, "seen": "pressed with 3 N"} for step in steps], feedback="afterwards")
+    page.get_by_text("To do: point 1, pressed with 3 N").wait_for()
+    pressed.click()  # it has not been drawn anew meanwhile
     page.get_by_role("button", name="point 2: compressible", exact=True).click()
     page.get_by_role("button", name="thrombus: at 1", exact=True).click()
     until(lambda: len(asked) == 3, "it is answered")
     both = ["not compressible", "compressible"]  # the scorer has not told of the first yet
     assert asked == [("answers", both[:1]), ("answers", both), ("thrombus", "1")]
+    scorer.say(steps, feedback="afterwards")
+    until(lambda: button.get_attribute("aria-pressed") == "true", "it is seen which was clicked")
+    assert pressed.is_visible()
     page.get_by_role("tab", name="Tissue").wait_for(state="hidden")
     page.get_by_role("button", name="Outlines").wait_for(state="hidden")
     scorer.say([{**step, "state": "done"} for step in steps], feedback="afterwards")

@@ -57,6 +57,8 @@ class ExercisePanel:
         self._picture = b""
         self._begun: str | None = None  # the attempt that is shown, by the time of its begin
         self._given: list[str] = []  # answers on its points that were clicked here
+        self._seen: list[ui.label] = []  # what was seen of each step
+        self._choices: dict[tuple[int, str], ui.button] = {}  # by step and answer
         with WhileShown(self._begin, self._end, EVERY_S, self._refresh):
             self._choice = ui.expansion("Exercises").classes("us-cases-more")
             with self._choice:
@@ -162,7 +164,7 @@ class ExercisePanel:
         if about.get("begun") != self._begun:
             self._begun, self._given = about.get("begun"), []
         parts: list[tuple[Element, Callable[..., None], tuple[Any, ...]]] = [
-            (self._steps, self._draw_steps, (steps, asks, tuple(self._find_answers()))),
+            (self._steps, self._draw_steps, ([(s["what"], s["state"]) for s in steps], asks)),
             (self._faults, _draw_faults, (score.get("faults", []),)),
             (self._plain, _draw_metrics, (score.get("plain", {}),)),
             (self._metrics, _draw_metrics, (score.get("metrics", {}),)),
@@ -173,37 +175,44 @@ class ExercisePanel:
                 with part:
                     draw(*shown)
                 self._parts[part] = shown
+        self._update_steps(steps)
 
     def _find_answers(self) -> list[str]:
         """Return the answers on points so far: those clicked here, or those that the scorer has."""
         known = self._scorer.parameters.get("answers")
         return [*self._given] or [each for each in (known.raw if known is not None else ()) if each]
 
-    def _draw_steps(
-        self, steps: Sequence[Mapping[str, Any]], asks: bool, answers: Sequence[str]
-    ) -> None:
-        for number, step in enumerate(steps):
-            word, icon = _LOOKS[step["state"]]
+    def _draw_steps(self, steps: Sequence[tuple[str, str]], asks: bool) -> None:
+        """Draw what is to be done, with its state, and the buttons to answer."""
+        self._seen, self._choices = [], {}
+        for number, (what, state) in enumerate(steps):
             with ui.row(wrap=False).classes("us-step") as row:
-                row.props["data-state"] = step["state"]
-                ui.icon(icon)
-                ui.label(f"{word}: {step['what']}, {step['seen']}")
-            if asks and step["state"] == "to do":
-                given = answers[number] if number < len(answers) else ""
-                self._ask(number, step["what"], len(steps), given)
+                row.props["data-state"] = state
+                ui.icon(_LOOKS[state][1])
+                self._seen.append(ui.label())
+            if asks and state == "to do":
+                with ui.row().classes("us-answers"):
+                    self._ask(number, what, len(steps))
 
-    def _ask(self, number: int, what: str, count: int, given: str) -> None:
+    def _ask(self, number: int, what: str, count: int) -> None:
         """Build the buttons by which the learner answers on a point, or on the thrombus."""
         points = [f"{k + 1}" for k in range(count - 1)]
         is_last = number == len(points)
-        with ui.row().classes("us-answers"):
-            for answer in (NO_THROMBUS, *points) if is_last else ANSWERS:
-                label = f"at {answer}" if answer.isdigit() else answer
-                button = ui.button(label).props("dense no-caps")
-                button.props["outline"] = answer != given
-                button.props["aria-pressed"] = str(answer == given).lower()
-                button.on_click(lambda answer=answer: self._answer(number, answer, is_last))
-                button.props["aria-label"] = f"{what}: {label}"
+        for answer in (NO_THROMBUS, *points) if is_last else ANSWERS:
+            label = f"at {answer}" if answer.isdigit() else answer
+            button = ui.button(label).props("dense no-caps")
+            button.on_click(lambda answer=answer: self._answer(number, answer, is_last))
+            button.props["aria-label"] = f"{what}: {label}"
+            self._choices[number, answer] = button
+
+    def _update_steps(self, steps: Sequence[Mapping[str, Any]]) -> None:
+        """Show what was seen and answered so far, with the same buttons."""
+        for label, step in zip(self._seen, steps, strict=True):
+            label.set_text(f"{_LOOKS[step['state']][0]}: {step['what']}, {step['seen']}")
+        given = dict(enumerate(self._find_answers()))
+        for (number, answer), button in self._choices.items():
+            button.props["outline"] = answer != given.get(number)
+            button.props["aria-pressed"] = str(answer == given.get(number)).lower()
 
     async def _answer(self, number: int, answer: str, is_last: bool) -> None:
         if is_last:
