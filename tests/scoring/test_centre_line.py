@@ -39,13 +39,13 @@ def test_where_a_turned_plane_cuts_it(tube, turn):
     line = CentreLine.from_labels(*tube)
     half = np.deg2rad(turn) / 2
     pose = Pose([SLOPE * 0.01, 0.01, 0.0], [0, 0, np.sin(half), np.cos(half)])
-    cut = line.find_cut(pose, 0.04)
-    found = line.interpolate_point(cut.along)
+    along, _ = line.find_cut(pose, 0.04)
+    found = line.interpolate_point(along)
     assert found == pytest.approx([SLOPE * 0.01, 0.01, 0.015], abs=0.4e-3)
-    other = line.find_cut(
-        Pose([SLOPE * -0.01, -0.01, 0.0], [0, 0, np.sin(half), np.cos(half)]), 0.04
+    other = Pose([SLOPE * -0.01, -0.01, 0.0], [0, 0, np.sin(half), np.cos(half)])
+    assert along - line.find_cut(other, 0.04)[0] == pytest.approx(
+        0.02 * np.hypot(1, SLOPE), abs=0.5e-3
     )
-    assert cut.along - other.along == pytest.approx(0.02 * np.hypot(1, SLOPE), abs=0.5e-3)
 
 
 def test_a_plane_beside_the_vessel_or_above_it_cuts_nothing(tube):

@@ -39,12 +39,12 @@ from us_sim.scene.building import (
 )
 from us_sim.scene.episode import DrawRanges
 from us_sim.scene.scene import Scene
-from us_sim.scoring.lumen import lift_probe
 from us_sim.settings.registry import SOLVERS
 from us_sim.skin.membrane import SkinMembrane
 from us_sim.slicing.acoustics.surface_echo import find_surface_normals
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.frame import Frame
+from us_sim.slicing.probe.probe import lift_probe
 from us_sim.slicing.strain import AxialStrain, compute_displacement
 from us_sim.tissue.elasticity.material import guess_tissue_kind
 from us_sim.tissue.elasticity.materials import LabelFractions

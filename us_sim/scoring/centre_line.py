@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,19 +13,6 @@ from us_sim.volume.volume import Volume
 
 _PIECE = 2e-3  # m, of the vessel's length, whose voxels give one point of the line
 _SMOOTHED = 5  # points, over which the line is straightened: a surface of voxels is uneven
-
-
-def compute_voxel_centres(volume: Volume, labels: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the centres (N, 3) m of a volume's marked voxels (i, j, k), in frame ``patient``."""
-    matrix = volume.index_to_patient
-    return np.asarray(np.argwhere(labels) @ matrix[:3, :3].T + matrix[:3, 3])
-
-
-class PlaneCut(NamedTuple):
-    """The place where a plane cuts a centre line."""
-
-    along: float  # m, from the end that is first along the line's main axis
-    lateral: float  # m, along the probe's face, from its middle
 
 
 @dataclass(frozen=True)
@@ -42,7 +28,7 @@ class CentreLine:
 
         The voxels are cut across their longest axis, and each piece of 2 mm gives its centroid.
         """
-        places = compute_voxel_centres(volume, labels)
+        places = volume.compute_centres(labels)
         if len(places) < 2:
             return None
         middle = places.mean(axis=0)
@@ -76,12 +62,16 @@ class CentreLine:
         lengths = self.lengths
         return np.array([np.interp(along, lengths, each) for each in self.points.T])
 
-    def find_cut(self, pose: Pose, width: float) -> PlaneCut | None:
+    def find_cut(self, pose: Pose, width: float) -> tuple[float, float] | None:
         """Find the cut of the line with a probe's image plane that is nearest below its face.
 
         Args:
             pose: of the probe, in frame ``patient``.
             width: m, of the image.
+
+        Returns:
+            m along the line, from the end that is first along its main axis, and m along the
+            probe's face from its middle; None where it cuts nothing.
         """
         seen = pose.inverse().transform_points(self.points)
         across = seen[:, 1]
@@ -94,4 +84,4 @@ class CentreLine:
             return None
         n = below[np.argmin(z[below])]
         length = np.linalg.norm(self.points[k[n] + 1] - self.points[k[n]])
-        return PlaneCut(float(self.lengths[k[n]] + part[n] * length), float(x[n]))
+        return float(self.lengths[k[n]] + part[n] * length), float(x[n])

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
 from us_sim.geometry.pose import Pose
-from us_sim.scoring.centre_line import CentreLine, compute_voxel_centres
+from us_sim.scoring.centre_line import CentreLine
 from us_sim.scoring.metrics import VesselSection
 from us_sim.slicing.b_mode import BMode
+from us_sim.slicing.probe.probe import lift_probe
 from us_sim.tissue.elasticity.material import guess_tissue_kind
 from us_sim.volume.volume import Volume
 
@@ -20,13 +21,6 @@ VESSELS = ("vein", "artery")  # kinds of tissue whose cross-sections are measure
 _HARDLY_CUT = 0.1
 """Of a vessel's mean cross-section, or else of its largest in an image at rest: less of it is its
 edge, or cut off by the image."""
-_STEEPEST = 0.2  # cosine of a probe's tilt; beyond it, how far to lift it means nothing
-
-
-def lift_probe(pose: Pose) -> Pose:
-    """Lift a probe within its image plane until it does not press into z > 0."""
-    depth = max(float(pose.position[2]), 0.0) / max(float(pose.rotation[2, 2]), _STEEPEST)
-    return Pose(pose.position - depth * pose.rotation[:, 2], pose.orientation)
 
 
 def find_lumen_labels(label_names: Mapping[int, str]) -> dict[str, tuple[int, ...]]:
@@ -60,7 +54,7 @@ def find_vessels(volume: Volume) -> tuple[dict[str, CentreLine], dict[str, tuple
         lines[name] = line
         clot = np.isin(volume.labels, numbers[1:])
         if clot.any():
-            along = line.find_arc_lengths(compute_voxel_centres(volume, clot))
+            along = line.find_arc_lengths(volume.compute_centres(clot))
             thrombi[name] = float(along.min()), float(along.max())
     return lines, thrombi
 

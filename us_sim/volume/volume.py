@@ -69,6 +69,11 @@ class Volume:
         extent.flags.writeable = False
         return extent
 
+    def compute_centres(self, voxels: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return the centres (N, 3) m of marked voxels (i, j, k), in frame ``patient``."""
+        matrix = self.index_to_patient
+        return np.asarray(np.argwhere(voxels) @ matrix[:3, :3].T + matrix[:3, 3])
+
 
 def compute_grid_extent(
     index_to_patient: NDArray[np.float64], shape: tuple[int, int, int]

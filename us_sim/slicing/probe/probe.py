@@ -456,6 +456,13 @@ class SectorProbe(Probe):
         return starts, np.column_stack([np.sin(angle), np.cos(angle)])
 
 
+def lift_probe(pose: Pose) -> Pose:
+    """Lift a probe within its image plane until it does not press into z > 0."""
+    cosine = max(float(pose.rotation[2, 2]), 0.2)  # beyond this tilt a lift means nothing
+    depth = max(float(pose.position[2]), 0.0) / cosine
+    return Pose(pose.position - depth * pose.rotation[:, 2], pose.orientation)
+
+
 def compute_image_outline(probe: Probe) -> NDArray[np.float64]:
     """Return (66, 3) m in frame ``probe``: along the face, then back where the image ends.
 
