@@ -200,6 +200,31 @@ def test_without_force_a_closed_vein_is_still_closed():
     assert done(replace(scanned(examination()), force=None)) == [True] * 3
 
 
+def test_what_is_done_while_nobody_knows_the_force_counts_nothing():
+    seen = scanned(examination())
+    times, newtons = seen.force.times, seen.force.newtons
+    second_press = (times > 7.0) & (times < 10.0)  # shaken so fast that no force is told
+    shaken = Force(times[~second_press], newtons[~second_press])
+    assert done(replace(seen, force=shaken)) == [True, False, True]
+    felt = until(seen, 6.0)
+    parts = read_exercise("compression").begin_attempt(seen.lines)
+    parts.add_scan(felt)
+    parts.add_scan(replace(seen, force=None, since=6.0))  # a piece without any
+    assert [step.is_done for step in parts.list_steps()] == [True, False, False]
+
+
+def test_a_silence_between_two_images_is_no_look():
+    first = POINTS[0]
+    jab = [(0.1, first, 9.0), (0.1, first, 9.0), (3, first, 9.0), (0.1, first, 0.5)]
+    way = [(0, first, 0.0), (1, first, 0.0), (1, first, 0.5), (1, first, 0.5), *jab]
+    seen = scanned([*way, (1, first, 0.5)], rate=10.0)
+    assert done(seen)[0]
+    vein = seen.sections["vein"]
+    shown = (vein.times < 3.25) | (vein.times > 6.05)
+    cut = VesselSection(*(each[shown] for each in vars(vein).values()))
+    assert not done(replace(seen, sections={"vein": cut}), artery=None)[0]
+
+
 def test_a_scene_that_is_loaded_under_a_pressed_probe_scores_nothing():
     pressed = [(0, POINTS[0], 0.5), *press(POINTS[0])]
     made = attempt(scanned([*pressed, *lift(POINTS[0])]))

@@ -43,7 +43,9 @@ def scan(left=(0.0, 0.0, 0.0), artery=(0.9, 0.9, 0.9), newtons=(6.0, 6.0, 6.0), 
 def steps(name, seen, **task):
     exercise = read_exercise(name)
     changed = replace(exercise.assigned, **task)
-    return Exercise("x", replace(exercise.task, given=changed)).evaluate_scan(seen)
+    attempt = Exercise("x", replace(exercise.task, given=changed)).begin_attempt(seen.lines)
+    attempt.add_scan(seen)
+    return attempt.list_steps()
 
 
 def done(name, seen, **task):
@@ -85,6 +87,16 @@ def test_a_vessel_is_centred_as_long_as_it_is_in_the_middle():
     assert steps("centre", in_air_between)[0].seen == "held for 0.0 s, 2.0 s at most"
 
 
+def test_a_vessel_is_not_centred_under_too_much_force():
+    times = np.arange(15.0)
+    for newtons, is_done in ((19.0, True), (21.0, False)):
+        pressed = Force(times, np.where(times > 1.0, newtons, 0.0))
+        seen = replace(with_lateral(np.zeros(15), 0.0), force=pressed)
+        [step] = steps("centre", seen)
+        assert step.is_done == is_done
+        assert ("press less" in step.seen) != is_done
+
+
 def test_nothing_counts_before_a_hand_has_moved_the_probe_in_the_air():
     times = np.linspace(0, 14, 1401)
     late = replace(scan(), force=Force(times, np.where(times < 2.0, 0.0, 5.0)))
@@ -98,7 +110,7 @@ def test_every_installed_exercise_can_be_read_and_is_of_a_scene_with_its_vessels
     files = [f for root in shared_roots() for f in (root / "config/exercises").glob("*.yaml")]
     assert {file.stem for file in files} >= {"compression", "keep_force"}
     for file in files:
-        assert read_exercise(file).evaluate_scan(scan())
+        assert read_exercise(file).begin_attempt(scan().lines).list_steps()
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 from us_sim.geometry.pose import Pose
 from us_sim.scoring.exercise import read_exercise
 from us_sim.scoring.live import LiveScan
-from us_sim.scoring.metrics import compute_metrics
+from us_sim.scoring.metrics import Tally
 from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.volume.volume import Volume
 
@@ -95,7 +95,7 @@ def test_the_score_so_far_is_that_of_all_samples_so_far(name):
         begin = attempt.touched or 0.0
         expected = [fault._replace(time=fault.time - begin) for fault in attempt.faults]
         assert (faults, seconds) == (expected, attempt.compute_duration())
-        expected = list(compute_metrics(counted)) if counted is not None else []
+        expected = list(Tally().add_scan(counted).list_metrics()) if counted is not None else []
         assert [each.label for each in metrics] == [each.label for each in expected]
         for found, known in zip(metrics, expected, strict=True):
             assert found.value == pytest.approx(known.value, rel=1e-9, nan_ok=True), found.label

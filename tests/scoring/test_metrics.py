@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 
 from us_sim.errors import ScoreError
-from us_sim.scoring.metrics import Force, Scan, Tally, VesselSection, compute_metrics
+from us_sim.scoring.metrics import Force, Scan, Tally, VesselSection
 from us_sim.scoring.motion import Motion
 from us_sim.scoring.settings import ScoreSettings
 
 
 def table(scan, settings=None):
-    return {
-        (m.name, m.roles.rpartition(" = ")[2]): m.value for m in compute_metrics(scan, settings)
-    }
+    metrics = Tally(settings).add_scan(scan).list_metrics()
+    return {(each.name, each.structure or "Probe"): each.value for each in metrics}
 
 
 def circle(seconds=4.0, radius=0.03, count=4001):

@@ -12,7 +12,7 @@ import SimpleITK as sitk
 
 from us_sim.errors import ScoreError
 from us_sim.geometry.mesh_file import read_with_meshio
-from us_sim.scoring.metrics import Scan, compute_metrics
+from us_sim.scoring.metrics import Scan, Tally
 from us_sim.scoring.motion import Motion
 
 MM = 1e3
@@ -24,7 +24,7 @@ def motion(times, matrices):
 
 
 def table(moved):
-    return {metric.name: metric.value for metric in compute_metrics(Scan(moved))}
+    return {each.name: each.value for each in Tally().add_scan(Scan(moved)).list_metrics()}
 
 
 def shown(times, time, tolerance=1e-3):

@@ -12,7 +12,7 @@ from us_sim.command.options import add_setting_options, read_settings
 from us_sim.errors import ScoreError
 from us_sim.progress import late_progress
 from us_sim.scoring.exercise import Exercise, Step, read_exercise
-from us_sim.scoring.metrics import compute_metrics
+from us_sim.scoring.metrics import Metric, Tally
 from us_sim.scoring.picture import draw_score
 from us_sim.scoring.settings import ScoreSettings
 from us_sim.share import find_bag
@@ -59,7 +59,7 @@ def _score_class(args: argparse.Namespace) -> int:
 
     _require_new(args.out, CLASS_FILES)
     table = tabulate_results(read_results(args.of_class))
-    print(table.drop(columns=["volume", "changed", "checksum"]).to_string(index=False))
+    print(table.loc[:, :"heard by"].to_string(index=False))
     for file in write_class_table(table, args.out) if args.out is not None else []:
         print(file)
     return 0
@@ -78,17 +78,21 @@ def _score(args: argparse.Namespace) -> int:
     out: Path | None = args.out
     _require_new(out, _FILES)
     scan = read_scan(args.session, args.topic, args.wrench, late_progress("score"))
-    metrics = list(compute_metrics(scan, settings))
-    rows = [(each.name, each.format(), each.unit, each.roles) for each in metrics]
+    metrics = list(Tally(settings).add_scan(scan).list_metrics())
+    rows = [(each.name, each.format(), each.unit, _format_roles(each)) for each in metrics]
     table = format_markdown_table(("metric", "value", "unit", "roles"), rows)
     missing = [f"left out: {sentence}" for sentence in scan.missing]
-    steps = exercise.evaluate_scan(scan) if exercise is not None else []
+    steps = []
+    if exercise is not None:
+        attempt = exercise.begin_attempt(scan.lines)
+        attempt.add_scan(scan)
+        steps = attempt.list_steps()
     done = _tabulate_steps(exercise, steps) if exercise is not None else ""
     print("\n".join(filter(None, [table, *missing, done])))
     if out is None:
         return 0
     out.mkdir(parents=True, exist_ok=True)
-    values = [(each.name, each.roles, each.unit, each.format()) for each in metrics]
+    values = [(each.name, _format_roles(each), each.unit, each.format()) for each in metrics]
     pd.DataFrame(values, columns=_HEAD).to_csv(out / "score.csv", index=False)
     draw_score(out / "score.png", args.session.name, scan, steps)
     page = [
@@ -104,6 +108,11 @@ def _score(args: argparse.Namespace) -> int:
     (out / "score.md").write_text(text, encoding="utf-8")
     print(out / "score.md")
     return 0
+
+
+def _format_roles(metric: Metric) -> str:
+    """Return the objects that a metric is of, as PerkTutor writes them."""
+    return f"Any = Probe, Structure = {metric.structure}" if metric.structure else "Any = Probe"
 
 
 def _tabulate_steps(exercise: Exercise, steps: Sequence[Step]) -> str:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from us_sim.errors import ScoreError
 from us_sim.geometry.pose import Pose
 from us_sim.scoring.centre_line import CentreLine
-from us_sim.scoring.exercise import Attempt, Fault, Step, Task
+from us_sim.scoring.exercise import SILENT, Attempt, Fault, Step, Task
 from us_sim.scoring.metrics import Scan
 from us_sim.scoring.settings import ANSWERS, CONTACT_FORCE, NO_ANSWER, NO_THROMBUS
 from us_sim.settings.quantity import Quantity
@@ -203,12 +203,12 @@ class _Examination(Attempt):
         vein, artery = (scan.sections.get(name or "") for name in (task.structure, task.artery))
         if vein is None:
             return
-        unknown = np.full(len(vein.times), np.nan)
-        newtons = unknown if force is None else force.interpolate_at(vein.times)
-        beside = np.nan_to_num(unknown if artery is None else artery.fraction, nan=1.0)
+        newtons = self.find_force(scan, vein.times)
+        beside = np.ones(len(newtons)) if artery is None else np.nan_to_num(artery.fraction, nan=1)
         rows = np.stack([vein.times, vein.along, vein.fraction, newtons, beside], axis=1)
         poses = scan.motion.sample_poses(vein.times)
-        for k in np.flatnonzero(vein.times > scan.since):
+        is_counted = np.isfinite(newtons) | (not self._is_felt)
+        for k in np.flatnonzero((vein.times > scan.since) & is_counted):
             time, along, part, newton, left = rows[k].tolist()
             if self.ended is not None and time > self.ended:
                 return
@@ -291,6 +291,10 @@ class _Examination(Attempt):
         if task.time_limit is not None and look.time - begun > task.time_limit:
             self.ended = look.time
             return
+        if look.time - self._looked > SILENT:  # nobody knows what was between
+            self._open = None
+            if self._press is not None:
+                self._press.closed_since = self._press.hard_since = np.inf
         self._along = look.along if np.isfinite(look.along) else self._along
         if self._press is None and look.is_pressing:
             self._press = _Press(look, self._explain_early(look))

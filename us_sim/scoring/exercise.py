@@ -30,7 +30,7 @@ _Array = NDArray[np.float64]
 _TIME, _FORCE = Quantity("time", 0.1, 3600.0), Quantity("force", 0.01, 200.0)
 _MM = 1e3
 _MOVED = 1e-3  # m, by which a hand has moved the probe
-_SILENT = 1.0  # s without a sample, in which nobody knows whether something was held
+SILENT = 1.0  # s without a sample, in which nobody knows whether something was held
 
 
 class Step(NamedTuple):
@@ -70,6 +70,7 @@ class Attempt(ABC):
     ended: float | None = None  # s, when all was done or the time was over; None before
     faults: Sequence[Fault] = ()  # everything that was done wrong, in order
     _has_begun = False
+    _is_felt = False  # there was a force
     # s and (3,) m: since when, and from where, the probe is in the air
     _air: tuple[float, _Array] | None = None
     _time = 0.0  # s, of the last pose
@@ -81,7 +82,8 @@ class Attempt(ABC):
 
     def add_scan(self, scan: Scan) -> Scan | None:
         """Add the samples that are new; return those that count, None before the begin."""
-        times, is_touching = scan.motion.times, np.ones(len(scan.motion), bool)
+        self._is_felt |= scan.force is not None
+        times, is_touching = scan.motion.times, np.full(len(scan.motion), not self._is_felt)
         if scan.force is not None:
             times, is_touching = scan.force.times, scan.force.newtons >= CONTACT_FORCE
             if not self._has_begun:
@@ -113,6 +115,11 @@ class Attempt(ABC):
             elif self._air is None:
                 self._air = time, place
         return None
+
+    def find_force(self, scan: Scan, times: _Array) -> _Array:
+        """Return the force (N) at times (s); NaN where it is not known."""
+        unknown = np.full(len(times), np.nan)
+        return unknown if scan.force is None else scan.force.interpolate_at(times)
 
     @abstractmethod
     def add_samples(self, scan: Scan) -> None:
@@ -181,6 +188,7 @@ class Centre(Task):
         Quantity("length", 1e-4, 1.0), "from the image's middle at most", default=0.003
     )
     duration: float = setting(_TIME, "without losing it", default=3.0)
+    force_limit: float = setting(_FORCE, "above which it is not held", default=20.0)
 
     def begin_attempt(self, lines: Mapping[str, CentreLine]) -> Attempt:
         """Return an attempt with one step."""
@@ -197,7 +205,7 @@ class _Holding(Attempt):
         """Add samples: their times (K,) s, and whether it was held at each."""
         for time, now in zip(times.tolist(), within.tolist(), strict=True):
             since = time - self._last
-            self._held = self._held + since if now and self._was and since <= _SILENT else 0.0
+            self._held = self._held + since if now and self._was and since <= SILENT else 0.0
             self._longest = max(self._longest, self._held)
             if self.ended is None and self._longest >= duration:
                 self.ended = time
@@ -235,6 +243,7 @@ class _KeptForce(_Holding):
 
 class _Centred(_Holding):
     _is_seen = False
+    _newtons = 0.0  # the last
 
     def __init__(self, task: Centre, line: CentreLine) -> None:
         self._task, self._line = task, line
@@ -245,9 +254,10 @@ class _Centred(_Holding):
             new = section.times > scan.since
             self._is_seen |= bool(np.isfinite(section.fraction[new]).any())
             within = np.abs(section.lateral[new]) <= task.offset
-            if scan.force is not None:
-                newtons = np.interp(section.times[new], scan.force.times, scan.force.newtons)
-                within &= newtons >= CONTACT_FORCE
+            if self._is_felt:
+                newtons = self.find_force(scan, section.times[new])
+                within &= (newtons >= CONTACT_FORCE) & (newtons <= task.force_limit)
+                self._newtons = [self._newtons, *newtons.tolist()][-1]
             self._hold(section.times[new], within, task.duration)
 
     def list_steps(self) -> list[Step]:
@@ -255,7 +265,8 @@ class _Centred(_Holding):
         what = f"{task.structure} within {_MM * task.offset:g} mm for {task.duration:g} s"
         if not self._is_seen:
             return [Step(what, False, "never in the image", points)]
-        return [self._step(what, target=points)]
+        is_over = self._newtons > task.force_limit
+        return [self._step(what, f"{self._newtons:.1f} N: press less; " * is_over, points)]
 
 
 @dataclass(frozen=True)
@@ -318,12 +329,6 @@ class Exercise(Settings):
         attempt: Attempt = self.assigned.begin_attempt(lines)
         attempt.is_blind = self.feedback == "afterwards"
         return attempt
-
-    def evaluate_scan(self, scan: Scan) -> list[Step]:
-        """Return the steps of the task in a whole scan, as of an attempt that is begun with it."""
-        attempt = self.begin_attempt(scan.lines)
-        attempt.add_scan(scan)
-        return attempt.list_steps()
 
 
 def read_exercise(name: str | Path) -> Exercise:

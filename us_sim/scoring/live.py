@@ -62,6 +62,7 @@ class LiveScan:
         labels = find_lumen_labels(volume.label_names)
         self._lumens = {name: labels[name] for name in self.lines}
         self._scanner, self._exercise, self._limits = scanner, exercise, limits
+        self._is_felt = False  # somebody tells the force
         self.clear()
 
     def clear(self) -> None:
@@ -72,6 +73,7 @@ class LiveScan:
         self._newtons: list[float] = []
         self._meter = LumenMeter(self._lumens, self._scanner, lines=self.lines)
         self._settled = -np.inf  # s, until when samples are in the tally and the attempt
+        self._final: Score | None = None  # of an attempt that has ended: nothing more counts
         self._tally = Tally(self._limits)
         exercise = self._exercise
         self._attempt = exercise.begin_attempt(self.lines) if exercise is not None else None
@@ -84,6 +86,7 @@ class LiveScan:
 
     def add_force(self, time: float, force: NDArray[np.float64]) -> None:
         """Add the force (3,) N on the probe, as `add_pose` a pose."""
+        self._is_felt = True
         if self._is_next(self._force_times, time):
             self._force_times.append(time)
             self._newtons.append(float(np.linalg.norm(force)))
@@ -101,7 +104,8 @@ class LiveScan:
         self._attempt.set_answers(points, thrombus, max(self._pose_times, default=0.0))
 
     def _is_next(self, times: list[float], time: float) -> bool:
-        return time > self._settled and not (times and time <= times[-1])
+        is_late = time <= self._settled or self._final is not None
+        return not is_late and not (times and time <= times[-1])
 
     def build_scan(self, since: float = -np.inf, until: float = np.inf) -> Scan | None:
         """Return the scan so far, or a piece of it, after a time until another (s).
@@ -124,7 +128,9 @@ class LiveScan:
         return Scan(motion, force, sections, self.lines, self._thrombi, since=since)
 
     def compute_score(self) -> Score | None:
-        """Return the score so far; None before there is a motion."""
+        """Return the score so far; None before there is a motion, and its force if it is felt."""
+        if self._final is not None or self._is_felt > bool(self._force_times):
+            return self._final
         until = self._find_end()
         piece = self.build_scan(self._settled, until) if until > self._settled else None
         if piece is not None:
@@ -139,7 +145,7 @@ class LiveScan:
         if attempt is None:
             return Score(metrics)
         begin = attempt.touched or 0.0
-        return Score(
+        score = Score(
             metrics,
             attempt.list_steps(),
             [fault._replace(time=fault.time - begin) for fault in attempt.faults],
@@ -147,6 +153,8 @@ class LiveScan:
             attempt.ended is not None,
             attempt.was_in_air,
         )
+        self._final = score if score.has_ended else None
+        return score
 
     def _find_end(self) -> float:
         """Return the last time (s) after which a piece may begin.

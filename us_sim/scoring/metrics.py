@@ -20,6 +20,7 @@ from us_sim.scoring.motion import Motion
 from us_sim.scoring.settings import CONTACT_FORCE, ScoreSettings
 
 _Array = NDArray[np.float64]
+_FAR = 0.25  # s from a sample of the force, from which on it is not known
 _MM, _MM2, _DEGREES = 1e3, 1e6, float(np.rad2deg(1.0))
 
 DEFINITIONS = {
@@ -40,11 +41,6 @@ class Metric:
     unit: str
     value: float
     structure: str = ""  # that it is of, beside the probe
-
-    @property
-    def roles(self) -> str:
-        """The objects that it is of, as PerkTutor writes them."""
-        return f"Any = Probe, Structure = {self.structure}" if self.structure else "Any = Probe"
 
     @property
     def label(self) -> str:
@@ -72,9 +68,11 @@ class Force:
             raise ScoreError("a force over time needs two samples, and a time for each")
 
     def interpolate_at(self, times: _Array) -> _Array:
-        """Interpolate the force (N) linearly; NaN before the first sample and after the last."""
+        """Interpolate the force (N) linearly; NaN beyond the samples, and far from both beside."""
         found = np.interp(times, self.times, self.newtons, left=np.nan, right=np.nan)
-        return np.asarray(found, np.float64)
+        after = np.searchsorted(self.times, times).clip(1, len(self.times) - 1)
+        apart = np.minimum(times - self.times[after - 1], self.times[after] - times)
+        return np.where(apart <= _FAR, found, np.nan)
 
 
 @dataclass(frozen=True)
@@ -115,11 +113,6 @@ class Scan:
         """Return the last of each values, as many as there are times after ``since``."""
         count = int(np.count_nonzero(times > self.since))
         return [each[max(len(each) - count, 0) :] for each in values]
-
-
-def compute_metrics(scan: Scan, settings: ScoreSettings | None = None) -> Iterator[Metric]:
-    """Compute all metrics that the scan has data for, in the order of a report."""
-    return Tally(settings).add_scan(scan).list_metrics()
 
 
 class Tally:
