@@ -27,7 +27,7 @@ VEIN = 6
 
 @pytest.fixture
 def node(bench, small_scene, tmp_path):
-    (tmp_path / "hold.yaml").write_text(KEEP)
+    (tmp_path / "hold.yaml").write_text(KEEP.replace("8 s", "10 s"))
     return bench.make(Scorer, scene=str(small_scene), exercise=str(tmp_path / "hold.yaml"))
 
 
@@ -44,18 +44,24 @@ def scanned(bench, node, small_scene):
     wrenches = bench.publisher(WrenchStamped, "probe/wrench")
     images = bench.publisher(Image, "ultrasound/labels")
     scores = bench.collect(DiagnosticArray, "score", latched=True)
-    for second in range(12):
+
+    def publish(second):
         pose = pose_at(0.0, second + 1, x=0.01 * (second % 2))
         poses.publish(pose)
         force = np.array([0, 3.0, -4.0]) if second else np.zeros(3)  # it comes from the air
         wrench = wrench_message(force, np.zeros(3), pose.header.stamp, "probe")
         wrenches.publish(wrench)
-    bench.spin_until(lambda: bool(scores) and is_whole(scores[-1]))
+
+    for second in range(11):
+        publish(second)
+    bench.spin_until(lambda: bool(scores) and values(scores[-1])["Elapsed Time, s"] == "10")
     came = node.health.received
     for count, second in enumerate(range(0, 11, 2), came + 1):  # at the pose where they were found
         stamp = pose_at(0.0, second + 1).header.stamp
         images.publish(image_message(half if second > 4 else labels, stamp, "probe"))
         bench.spin_until(lambda count=count: node.health.received == count)
+    publish(11)  # the last one, after which nothing counts
+    bench.spin_until(lambda: values(scores[-1])["Elapsed Time, s"] == "11")
     return scores, part
 
 
@@ -74,10 +80,6 @@ def test_what_the_hand_did_is_told_as_numbers_and_steps(bench, scanned):
     assert float(found[area]) == pytest.approx(100 * part, rel=1e-4)
     step = scores[-1].status[1]
     assert (step.level, step.message) == (DiagnosticStatus.OK, "held for 10.0 s")
-
-
-def is_whole(score):
-    return values(score)["Elapsed Time, s"] == "11"
 
 
 def ask(bench, name):
@@ -106,9 +108,7 @@ def test_the_picture_is_drawn_once_passed_and_when_asked_for_and_cleared(bench):
 def test_clear_begins_anew(bench, scanned):
     scores, _ = scanned
     assert ask(bench, "clear")
-    poses = bench.publisher(PoseStamped, "probe/pose")
-    for second in (20, 21):
-        poses.publish(pose_at(0.0, second))
+    press(bench, 0.0, 2)
     bench.spin_until(lambda: values(scores[-1])["Elapsed Time, s"] == "1")
     assert scores[-1].status[1].level == DiagnosticStatus.WARN
 
@@ -305,6 +305,36 @@ def test_who_moves_the_probe_stands_in_the_result(bench):
     press(bench, 5.0)
     bench.spin_until(lambda: bool(scores))
     bench.spin_until(lambda: told(scores[-1], "about")["moved by"] == "bench")
+    bench.collect(PoseStamped, "probe/pose")
+    bench.spin_until(lambda: told(scores[-1], "about")["heard by"] == "bench")
+
+
+def test_what_was_chosen_at_the_start_stands_in_the_result(bench, small_scene, tmp_path):
+    (tmp_path / "hold.yaml").write_text(KEEP)
+    exercise = str(tmp_path / "hold.yaml")
+    bench.make(Scorer, scene=str(small_scene), exercise=exercise, chosen=["scene.seed = 7"])
+    scores = bench.collect(DiagnosticArray, "score", latched=True)
+    press(bench, 5.0)
+    bench.spin_until(lambda: bool(scores))
+    about = told(scores[-1], "about")
+    assert about["changed"] == "scene.seed = 7 before"
+    assert about["scene checksum"] == load_scene(str(small_scene)).compute_checksum()
+
+
+def test_nothing_counts_after_the_end(bench, node):
+    scores = bench.collect(DiagnosticArray, "score", latched=True)
+    press(bench, 5.0)
+    bench.spin_until(lambda: bool(scores) and told_state(scores[-1]) == "passed")
+    before = values(scores[-1])
+    press(bench, 9.0, 40)
+    bench.spin_until(lambda: node.health.received >= 104)
+    count = len(scores)
+    bench.spin_until(lambda: len(scores) > count)
+    assert values(scores[-1]) == before
+
+
+def told_state(score):
+    return statuses(score, "plain")[0].message
 
 
 def test_an_attempt_does_not_begin_before_the_tissue_answers(bench, node):

@@ -184,6 +184,16 @@ def test_a_scene_s_own_recording_is_played_to_its_tracker_and_held_at_its_end():
         make_plan(RunRequest(without))
 
 
+def test_what_a_person_chose_beside_the_exercise_goes_to_the_scorer():
+    request = RunRequest(
+        load_scene("exercise:examination#7"), {"tissue_deformer": {"solver": "fem"}}
+    )
+    [scorer] = [each for each in make_plan(request).processes if each.node == "scorer"]
+    assert scorer.parameters["chosen"] == ["tissue_deformer.solver = fem", "scene.seed = 7"]
+    drawn = make_plan(RunRequest(load_scene("exercise:examination")))
+    assert not any("chosen" in each.parameters for each in drawn.processes)
+
+
 def test_all_scenes_are_listed_once_that_which_runs_first(running, small_scene):
     simulation, _, control = running
     for _ in range(40):

@@ -21,10 +21,25 @@ def test_a_seed_is_drawn_once_for_all_nodes(tmp_path):
     drawn = load_scene("exercise:examination")
     assert 1 <= drawn.volume.seed <= 1000
     assert load_scene(drawn.origin) == drawn
+    assert drawn.is_drawn
+    assert not load_scene(drawn.origin).is_drawn
     assert load_scene("exercise:examination#7").volume.seed == 7
     file = tmp_path / "e.yaml"
     file.write_text(EXAMINATION + "task: {kind: compression}\n")
     assert load_scene(f"exercise:{file}").volume.seed == 3
+
+
+def test_a_checksum_is_of_all_that_is_set_but_the_seed_wherever_it_lies(tmp_path):
+    known = load_scene("exercise:examination#7")
+    assert known.compute_checksum() == load_scene("exercise:examination#8").compute_checksum()
+    checksums = []
+    for folder, vein in (("a", 5), ("b", 5), ("c", 6)):
+        (tmp_path / folder).mkdir()
+        file = tmp_path / folder / "soft.yaml"
+        soft = f"tissue: {{materials: {{vein: {{young_modulus: {vein} kPa}}}}}}"
+        file.write_text(f"name: soft\nbased_on: upper_arm\n{soft}\n")
+        checksums.append(load_scene(file).compute_checksum())
+    assert checksums[0] == checksums[1] != checksums[2]
 
 
 @pytest.mark.parametrize(

@@ -137,7 +137,10 @@ def test_results_that_a_place_refuses_are_kept_until_it_takes_them(tmp_path, mon
 def test_the_table_of_a_class_has_a_row_for_each_attempt(tmp_path):
     begun = [f"2026-11-29T07:0{k}:00+00:00" for k in range(3)]
     results = [result("Ada", begun[0], 1), result("Bob", begun[1], 3), result("Ada", begun[2], 3)]
+    for each, checksum in zip(results, ("a1b2", "a1b2", "ffff"), strict=True):
+        each["about"] |= {"checksum": checksum}
     table = tabulate_results(results)
+    assert list(table["checksum"]) == ["a1b2", "a1b2", "ffff, unlike most"]
     csv, page = write_class_table(table, tmp_path / "out")
     kept = pd.read_csv(csv)
     assert list(kept["student"]) == ["Ada", "Bob", "Ada"]

@@ -26,7 +26,7 @@ from us_sim.nodes.parameters import LiveSettings, declare_settings
 from us_sim.nodes.process import node_main
 from us_sim.nodes.qos import EVERY
 from us_sim.nodes.scene_node import LEAD_TOPIC, SceneNode
-from us_sim.nodes.settings import ScorerSettings
+from us_sim.nodes.settings import VIEWER, ScorerSettings
 from us_sim.recording.decoding import nanoseconds_of, pixels_from, pose_from, wrench_from
 from us_sim.scene.building import build_scanner, load_volume
 from us_sim.scoring.exercise import Step, read_exercise
@@ -75,7 +75,9 @@ class Scorer(SceneNode):
         self._void = "the scorer was started again: begin anew" if self._settings.begun else ""
         self._is_known = False  # a result has shown the truth about this arm
         self._is_tissue_ready = self.scene.tissue is None
-        self._changes: dict[str, str] = {}  # when, by what was set
+        self._changes = dict.fromkeys(self._settings.chosen, "")  # when, by what was set
+        self._scene_checksum = self.scene.compute_checksum()
+        self._own_nodes = {OWN, VIEWER, *(part.node for part in self.scene.list_parts())}
         self._begin_attempt()
         self._score = self.create_latched_publisher(DiagnosticArray, "score")
         self._picture = self.create_latched_publisher(CompressedImage, "score/picture")
@@ -103,6 +105,7 @@ class Scorer(SceneNode):
         self._begin = self._measured = 0  # ns
         self._changes = dict.fromkeys(self._changes, "before")
         self._movers: set[str] = set()  # nodes that publish poses
+        self._hearers: set[str] = set()  # and that hear the probe's
         self._begun = datetime.now().astimezone().isoformat(timespec="seconds")
         self.health.values = {}
 
@@ -143,11 +146,8 @@ class Scorer(SceneNode):
             return
         for changed in message.changed_parameters:
             value = parameter_value_to_python(changed.value)
-            when = (
-                f"at {self._seconds(nanoseconds_of(message.stamp)):.0f} s"
-                if self._begin
-                else "before"
-            )
+            at = self._seconds(nanoseconds_of(message.stamp))
+            when = f"at {at:.0f} s" if self._begin else "before"
             self._changes[f"{node}.{changed.name} = {value}"] = when
 
     def _publish_score(self) -> None:
@@ -157,10 +157,10 @@ class Scorer(SceneNode):
             return
         movers = self.get_publishers_info_by_topic(self.resolve_topic_name(LEAD_TOPIC))
         self._movers.update(each.node_name for each in movers)
+        hearers = self.get_subscriptions_info_by_topic(self.resolve_topic_name("probe/pose"))
+        self._hearers.update(each.node_name for each in hearers)
         is_wanted = self._score.get_subscription_count() > 0
-        if not is_wanted and self._place is None:
-            return
-        score = self._live.compute_score()
+        score = self._live.compute_score() if is_wanted or self._place is not None else None
         if score is None:
             return
         if is_wanted:
@@ -197,7 +197,9 @@ class Scorer(SceneNode):
             "scene": self.scene.name,
             "volume": self.scene.volume.name,
             "method": tissue.solver if tissue is not None else "none",
+            "scene checksum": self._scene_checksum,
             "moved by": ", ".join(sorted(self._movers)),
+            "heard by": ", ".join(sorted(self._hearers - self._own_nodes)),
             "changed": "; ".join(f"{what} {when}" for what, when in self._changes.items()),
             "arm": "known from an attempt before" if self._is_known else "",
             "us_sim": __version__,

@@ -407,6 +407,9 @@ class ScorerSettings(Settings):
         description="folder, or address of fsspec, for each result",
         default=None,
     )
+    chosen: tuple[str, ...] = setting(
+        description="what was set at the start, beside the scene, which results tell", default=()
+    )
     answers: tuple[str, ...] = setting(
         description="of the student, if the exercise asks, for each point: compressible, not "
         "compressible, not seen, or - for none yet",

@@ -193,8 +193,9 @@ def make_plan(request: RunRequest) -> Plan:
     own: dict[str, dict[str, object]] = {node: {} for node in needed}
     if played or request.by_hand:
         own["probe_tracker"] = {"source": "pose"}
+    own["scorer"] = _make_chosen(scene, given)
     if request.results:
-        own["scorer"] = {"student": request.student, "results": request.results}
+        own["scorer"] |= {"student": request.student, "results": request.results}
     processes += [NodeProcess(node, common | own[node] | pop_parameters(node)) for node in needed]
     if given:
         raise UsSimError(
@@ -212,6 +213,15 @@ def make_plan(request: RunRequest) -> Plan:
     poses = None if settings.get("stay") else len(path)
     processes.append(NodeProcess("path_player", settings | player))
     return Plan(processes, poses, request.duration, topic=path.topic)
+
+
+def _make_chosen(scene: Scene, given: Parameters) -> dict[str, object]:
+    """Return the scorer's parameter of what a person has set in place of the scene's, if any."""
+    texts = [(f"{node}.{name}", text) for node in given for name, text in given[node].items()]
+    if scene.origin.endswith(f"#{scene.volume.seed}") and not scene.is_drawn:
+        texts.append(("scene.seed", str(scene.volume.seed)))
+    chosen = [f"{name} = {text}" for name, text in texts if not name.startswith("scorer.")]
+    return {"chosen": chosen} if chosen else {}  # [] has no type
 
 
 def _await_scene(scene: Scene, processes: Iterable[NodeProcess]) -> dict[str, object]:

@@ -313,7 +313,8 @@ def load_scene(name: str | Path, *, volume: str | Path | None = None) -> Scene:
     document, folders, origin = read_scene_document(name)
     if volume and isinstance(document, dict):
         document = with_volume(document, str(full_path(volume)))
-    return parse_scene(document, origin=origin, folders=folders)
+    is_drawn = "#" in origin and "#" not in str(name)
+    return replace(parse_scene(document, origin=origin, folders=folders), is_drawn=is_drawn)
 
 
 def read_scene_document(name: str | Path) -> tuple[Any, list[Path], str]:

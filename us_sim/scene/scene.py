@@ -5,8 +5,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import os
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -254,6 +258,7 @@ class Scene(Settings):
         file=True,
     )
     origin: str = "scene"
+    is_drawn: bool = field(default=False, compare=False)  # its seed, at random
 
     def check(self) -> None:
         """Require sections that others need."""
@@ -281,6 +286,12 @@ class Scene(Settings):
             *([Part("scorer", True, f"the exercise is {self.exercise}")] if self.exercise else []),
         ]
 
+    def compute_checksum(self) -> str:
+        """Return 12 digits of a SHA-256 of all that is set but the seed, files by their content."""
+        same = replace(self, origin="", volume=replace(self.volume, seed=0))
+        document = json.dumps(_read_named_files(asdict(same)), default=str, sort_keys=True)
+        return hashlib.sha256(document.encode()).hexdigest()[:12]
+
     @property
     def flows(self) -> dict[str, FlowSettings]:
         """Flows of the blood in structures, by the structures' names."""
@@ -306,6 +317,18 @@ class Scene(Settings):
     def solver_settings(self, name: str) -> Any:
         """Return the scene's settings of a solver, or None."""
         return self.tissue.settings.get(name) if self.tissue else None
+
+
+def _read_named_files(value: Any) -> Any:
+    """Return JSON-like values with digests of files in place of their paths, which may differ."""
+    if isinstance(value, Mapping):
+        return {str(key): _read_named_files(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_read_named_files(each) for each in value]
+    if not isinstance(value, str) or not os.path.isabs(value):
+        return value
+    path = Path(value)
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else path.name
 
 
 def _optional_part(node: str, section: object | None, key: str, consequence: str) -> Part:

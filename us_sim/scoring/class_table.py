@@ -12,12 +12,16 @@ import pandas as pd
 from us_sim.scoring.result import encode_picture
 
 CLASS_FILES = ("class.csv", "class.html")
-_ABOUT = ("volume", "moved by", "changed", "checksum")
+_CHECKSUMS = ("checksum", "scene checksum")
+_ABOUT = ("moved by", "heard by", "volume", "changed", *_CHECKSUMS)
 _ALT = "Points right of each attempt, over time, for each student"
 
 
 def tabulate_results(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Return one row for each result: who, what, when, what became of it, and plain metrics."""
+    """Return one row for each result: who, what, when, what became of it, and plain metrics.
+
+    Checksums that most results of the exercise do not have are marked.
+    """
     rows = [
         {
             "student": each["about"].get("student") or "somebody",
@@ -32,7 +36,11 @@ def tabulate_results(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         }
         for each in results
     ]
-    return pd.DataFrame(rows)
+    table = pd.DataFrame(rows)
+    for key in _CHECKSUMS:
+        most = table.groupby("exercise")[key].transform(lambda each: each.mode().iloc[0])
+        table[key] = table[key].where(table[key] == most, table[key] + ", unlike most")
+    return table
 
 
 def write_class_table(table: pd.DataFrame, folder: Path) -> list[Path]:
@@ -63,12 +71,11 @@ def _draw(table: pd.DataFrame) -> bytes:
     figure = Figure(figsize=(9, 1.0 + 1.8 * len(exercises)), dpi=100, layout="constrained")
     grid = figure.subplots(len(exercises), 1, sharex=True, squeeze=False)
     times = pd.to_datetime(table["begun"], utc=True)
-    students = {name: f"C{k % 10}" for k, name in enumerate(sorted(table["student"].unique()))}
+    part = 100 * table["right"] / table["of"].clip(lower=1)
     for axes, exercise in zip(grid[:, 0], exercises, strict=True):
-        for student, colour in students.items():
-            mine = table[(table["exercise"] == exercise) & (table["student"] == student)]
-            part = 100 * mine["right"] / mine["of"].clip(lower=1)
-            axes.plot(times[mine.index], part, "o-", color=colour, label=student)
+        for student, all_of_one in table.groupby("student"):
+            mine = all_of_one.index[all_of_one["exercise"] == exercise]
+            axes.plot(times[mine], part[mine], "o-", label=student)
         axes.set(title=exercise, ylabel="right, %", ylim=(-5, 105))
         axes.grid(True, color="0.93")
         axes.spines[["top", "right"]].set_visible(False)
