@@ -1,10 +1,12 @@
 """A score that grows with its scan: it is that of the whole scan, and no sample is added twice."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from us_sim.errors import ScoreError
 from us_sim.geometry.pose import Pose
 from us_sim.scoring.exercise import read_exercise
 from us_sim.scoring.live import LiveScan
@@ -103,3 +105,19 @@ def test_the_score_so_far_is_that_of_all_samples_so_far(name):
             assert step[:3] == known[:3]
             told.add(step.seen)
     assert len(told) >= 3  # something went on
+
+
+def test_nothing_counts_after_the_end():
+    exercise = read_exercise("compression")
+    task = replace(exercise.task, given=replace(exercise.assigned, time_limit=4.0))
+    exercise = replace(exercise, task=task, feedback="afterwards")
+    scores = []
+    for scan in scanned(exercise, 1, 24):
+        score = scan.compute_score()
+        scores += [score] if score is not None and score.has_ended else []
+    assert len(scores) > 15
+    assert all(score is scores[0] for score in scores)
+    with pytest.raises(ScoreError, match="ended"):
+        scan.set_answers(["compressible"], "none")
+    scan.clear()
+    assert scan.compute_score() is None

@@ -258,7 +258,7 @@ class Scene(Settings):
         file=True,
     )
     origin: str = "scene"
-    is_drawn: bool = field(default=False, compare=False)  # its seed, at random
+    is_drawn: bool = field(default=False, compare=False)  # its seed, by chance
 
     def check(self) -> None:
         """Require sections that others need."""

@@ -265,8 +265,8 @@ class _Centred(_Holding):
         what = f"{task.structure} within {_MM * task.offset:g} mm for {task.duration:g} s"
         if not self._is_seen:
             return [Step(what, False, "never in the image", points)]
-        is_over = self._newtons > task.force_limit
-        return [self._step(what, f"{self._newtons:.1f} N: press less; " * is_over, points)]
+        now = f"{self._newtons:.1f} N: press less; " if self._newtons > task.force_limit else ""
+        return [self._step(what, now, points)]
 
 
 @dataclass(frozen=True)

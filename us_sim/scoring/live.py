@@ -62,7 +62,7 @@ class LiveScan:
         labels = find_lumen_labels(volume.label_names)
         self._lumens = {name: labels[name] for name in self.lines}
         self._scanner, self._exercise, self._limits = scanner, exercise, limits
-        self._is_felt = False  # somebody tells the force
+        self._is_felt = False  # a force has been told
         self.clear()
 
     def clear(self) -> None:
@@ -104,8 +104,7 @@ class LiveScan:
         self._attempt.set_answers(points, thrombus, max(self._pose_times, default=0.0))
 
     def _is_next(self, times: list[float], time: float) -> bool:
-        is_late = time <= self._settled or self._final is not None
-        return not is_late and not (times and time <= times[-1])
+        return self._final is None and time > max([self._settled, *times[-1:]])
 
     def build_scan(self, since: float = -np.inf, until: float = np.inf) -> Scan | None:
         """Return the scan so far, or a piece of it, after a time until another (s).
@@ -128,8 +127,8 @@ class LiveScan:
         return Scan(motion, force, sections, self.lines, self._thrombi, since=since)
 
     def compute_score(self) -> Score | None:
-        """Return the score so far; None before there is a motion, and its force if it is felt."""
-        if self._final is not None or self._is_felt > bool(self._force_times):
+        """Return the score so far; None before there is a motion, and a force if one is told."""
+        if self._final is not None or (self._is_felt and not self._force_times):
             return self._final
         until = self._find_end()
         piece = self.build_scan(self._settled, until) if until > self._settled else None
@@ -153,7 +152,8 @@ class LiveScan:
             attempt.ended is not None,
             attempt.was_in_air,
         )
-        self._final = score if score.has_ended else None
+        if score.has_ended:
+            self._final, self._attempt = score, attempt
         return score
 
     def _find_end(self) -> float:

@@ -68,7 +68,7 @@ class Force:
             raise ScoreError("a force over time needs two samples, and a time for each")
 
     def interpolate_at(self, times: _Array) -> _Array:
-        """Interpolate the force (N) linearly; NaN beyond the samples, and far from both beside."""
+        """Interpolate the force (N) linearly; NaN before, after, and far from all samples."""
         found = np.interp(times, self.times, self.newtons, left=np.nan, right=np.nan)
         after = np.searchsorted(self.times, times).clip(1, len(self.times) - 1)
         apart = np.minimum(times - self.times[after - 1], self.times[after] - times)
