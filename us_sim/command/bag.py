@@ -69,12 +69,18 @@ def _info(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> int:
+    from us_sim.errors import printable_line
     from us_sim.progress import late_progress
     from us_sim.recording.reader import read_bag
-    from us_sim.run.session_check import check_bag, format_report
+    from us_sim.run.session_check import check_bag
+    from us_sim.settings.spelling import align_columns
 
     found = check_bag(read_bag(args.file), late_progress(f"bag check {args.file.name}"))
-    print(format_report(found))
+    size = sum(int(each.messages["size"].sum()) for each in found.topics) / 1e6
+    head = f"{found.bag.path}: {found.bag.message_count} messages, {size:.1f} MB"
+    told = [f"{each.kind}: {each.text}" for each in found.findings]
+    for line in (head, "", *align_columns(found.rows), "", *(told or ["nothing is wrong with it"])):
+        print(printable_line(line))
     return int(bool(found.findings))
 
 

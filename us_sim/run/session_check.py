@@ -13,14 +13,13 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from us_sim import Progress
-from us_sim.errors import printable_line
 from us_sim.nodes.settings import AnnotatedImageSettings
 from us_sim.nodes.topics import TOPICS
 from us_sim.recording.decoding import SECOND
 from us_sim.recording.reader import Bag
 from us_sim.recording.topic import BagTopic
 from us_sim.run.session_tables import read_times
-from us_sim.settings.spelling import align_columns, format_count
+from us_sim.settings.spelling import format_count
 
 POSES = "probe/pose"
 DERIVED = [
@@ -236,12 +235,3 @@ def check_bag(bag: Bag, progress: Progress = lambda *_: None) -> BagCheck:
     if not bag.message_count:
         faults.append(f"{bag.path} holds no message: record again")
     return BagCheck(bag, topics, [*(Finding("index", text) for text in faults), *findings])
-
-
-def format_report(found: BagCheck) -> str:
-    """Make the table, and a line for each finding, for a person."""
-    size = sum(int(each.messages["size"].sum()) for each in found.topics) / 1e6
-    head = f"{found.bag.path}: {found.bag.message_count} messages, {size:.1f} MB"
-    told = [f"{each.kind}: {each.text}" for each in found.findings]
-    lines = [head, "", *align_columns(found.rows), "", *(told or ["nothing is wrong with it"])]
-    return "\n".join(printable_line(line) for line in lines)
