@@ -114,7 +114,7 @@ class Listener:
         self._context.try_shutdown()
 
 
-FORKS = "us_sim nodes"  # the title of the process that forks them
+KEEPS, FORKS = "us_sim keeper", "us_sim nodes"  # the titles of what forks what forks them
 
 
 def children_of(parent):
@@ -136,8 +136,14 @@ def nodes_of(run):
     from us_sim.nodes.settings import NODES
 
     own = children_of(run)
-    all_of_it = {**own, **children_of(own[FORKS])} if FORKS in own else own
-    return {title: pid for title, pid in all_of_it.items() if title in NODES}
+    for title in KEEPS, FORKS:
+        own |= children_of(own[title]) if title in own else {}
+    return {title: pid for title, pid in own.items() if title in NODES}
+
+
+def forks_of(run):
+    """The process that forks a simulation's nodes."""
+    return children_of(children_of(run)[KEEPS])[FORKS]
 
 
 def restart(listener, node, number, own):
@@ -203,7 +209,7 @@ def main():
         while len(done) < asked.count and time.monotonic() < ends:
             listener.spin(1.0 + chance.random())
             listener.wait_for_full_rate()
-            own = nodes_of(run.pid) | {FORKS: children_of(run.pid)[FORKS]}
+            own = nodes_of(run.pid) | {FORKS: forks_of(run.pid)}
             node = chance.choice(sorted(own))
             number = signal.SIGKILL if node == FORKS else chance.choice(SIGNALS)
             done.append(restart(listener, node, number, own))

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from many_restarts import FORKS, children_of, nodes_of
+from many_restarts import forks_of, nodes_of
 
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
@@ -124,7 +124,7 @@ def test_where_nodes_are_forked_ends_they_end_and_are_back(played_scene, tmp_pat
     run = started("run", played_scene, "--duration", "100", cwd=tmp_path)
     try:
         wait_until(lambda: len(nodes_of(run.pid)) == 4, run)
-        before, server = nodes_of(run.pid), children_of(run.pid)[FORKS]
+        before, server = nodes_of(run.pid), forks_of(run.pid)
         os.kill(server, signal.SIGKILL)
         wait_until(lambda: len({*nodes_of(run.pid).values()} - {*before.values()}) == 4, run)
         wait_until(lambda: not any(Path(f"/proc/{p}").exists() for p in before.values()), run)

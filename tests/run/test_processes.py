@@ -70,6 +70,22 @@ def test_what_forks_nodes_has_one_thread_and_no_rclpy():
     assert ended.stdout.split() == ["1", "False"], ended.stderr
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere nodes are not forked")
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGSTOP])
+def test_what_forks_nodes_is_there_again_after_a_signal(number):
+    program = "import us_sim.run.preloaded, os, sys; "
+    program += "print(os.getpid(), flush=True); sys.stdin.read(); exit(3)"
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", program], stdin=pipe, stdout=pipe) as keeper:
+        first = int(keeper.stdout.readline())
+        os.kill(first, number)
+        if number != signal.SIGSTOP:
+            assert int(keeper.stdout.readline()) != first
+            assert not runs(first)
+        keeper.stdin.close()
+        assert keeper.wait(30) == 3
+
+
 STARTS = """
 import time
 from us_sim.run.plan import NodeProcess

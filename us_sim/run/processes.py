@@ -2,7 +2,7 @@
 
 On Linux nodes are forked from a process that has imported what they share, so that they start
 soon: multiprocessing's fork server, which never imports rclpy, since its tracing starts threads.
-Where it ends, so do they, and the supervisor starts them again from another.
+Where it is killed, so are they, and a process that keeps what is imported forks another at once.
 """
 
 from __future__ import annotations
@@ -33,10 +33,9 @@ _UNKNOWN = 255  # the exit status of what was forked by a server that has ended
 _PR_SET_PDEATHSIG = 1
 
 _spawning: Any = multiprocessing.get_context("spawn")
-_forking: Any = _spawning
-if sys.platform == "linux":  # elsewhere forks are not safe
-    _forking = multiprocessing.get_context("forkserver")
-    _forking.set_forkserver_preload([f"{__package__}.preloaded"])
+_can_fork = sys.platform == "linux"  # elsewhere forks are not safe
+_forking: Any = multiprocessing.get_context("forkserver" if _can_fork else "spawn")
+_forking.set_forkserver_preload([f"{__package__}.preloaded"])
 
 
 @contextlib.contextmanager
@@ -51,7 +50,7 @@ def _without_interrupts() -> Iterator[None]:
 
 def begin_fork_server() -> None:
     """Have the server import what nodes share while this process does something else."""
-    if _forking is not _spawning:
+    if _can_fork:
         resource_tracker.ensure_running()  # which lets Ctrl-C through when it has been started
         with _without_interrupts():
             ensure_running()
@@ -84,9 +83,7 @@ def end_with_parent(number: signal.Signals) -> None:
 
 
 class RunningNode:
-    """A node's process, and the thread that reads its output.
-
-    It ends when this process or the fork server ends.
+    """A node's process, which ends with this one, and the thread that reads its output.
 
     Args:
         node: what it runs.

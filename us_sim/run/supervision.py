@@ -38,8 +38,7 @@ IMAGES, IMAGER = "ultrasound/image", "slice_interpolator"
 RECORDER_STOP_S = 10.0  # a recorder may take to end: it writes what it still holds
 START_S = 900.0  # for the first report: a first run compiles for minutes
 RESTART_S = 120.0  # likewise of a node that was ready before, whose kernels are kept
-STEP_S = 0.5
-"""A longer time between two looks counts as this much: this process was stopped or had no time."""
+STEP_S = 0.5  # the most that counts between two looks: it was stopped meanwhile, or had no time
 TOLD = 4  # losses that are told one by one in a sentence
 
 
