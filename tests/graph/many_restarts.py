@@ -53,9 +53,11 @@ class Listener:
         from rclpy.node import Node
         from sensor_msgs.msg import Image
 
+        from us_sim.nodes import announce_often
         from us_sim.nodes.session_monitor import SessionMonitor
         from us_sim.nodes.settings import NODES
 
+        announce_often()  # as the page does
         self._context = Context()
         rclpy.init(args=[], context=self._context)
         node = Node("restarts_listener", context=self._context)
