@@ -30,7 +30,8 @@ PARAMETERS = (
     made("contact", ParameterKind.TRUTH, False),
     made("colour.pulses", ParameterKind.WHOLE, 10, limits=(3, 64)),
     made("flow.direction", ParameterKind.NUMBERS, (0.0, 1.0, 0.0)),
-    made("scene", ParameterKind.TEXT, "arm", is_live=False),
+    made("frame", ParameterKind.TEXT, "arm", is_live=False),
+    made("scene", ParameterKind.TEXT, "exercise:e#7", is_live=False),
 )
 
 
@@ -176,8 +177,9 @@ def test_every_kind_has_its_control_and_the_keyboard_will_do(page: Any, node: No
     field(page, "flow.direction").press("Enter")
     until(lambda: node.values("flow.direction") == [(1.0, 0.0, 0.0)], "a list")
     page.get_by_text("Given at the start", exact=True).click()
-    until(lambda: "arm" in control(page, "scene").inner_text(), "what cannot be set is shown")
-    assert control(page, "scene").locator("input").count() == 0
+    until(lambda: "arm" in control(page, "frame").inner_text(), "what cannot be set is shown")
+    assert control(page, "frame").locator("input").count() == 0
+    assert not page.get_by_text("#7").count()  # which would name an examination's arm
 
 
 def test_nothing_is_watched_that_cannot_be_seen(page: Any, node: Node) -> None:

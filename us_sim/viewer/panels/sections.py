@@ -65,7 +65,8 @@ def arrange_parameters(
             chosen.append(ParameterSection(title, tuple(names), is_shown=is_shown))
         else:
             others.append(ParameterSection(format_title(group) or "More", tuple(names)))
-    fixed = {name: format_name(name) for name in parameters if name not in live}
+    # The header has the scene, which would name an examination's arm.
+    fixed = {name: format_name(name) for name in parameters if name not in (*live, "scene")}
     last = ParameterSection("Given at the start", tuple(fixed), fixed)
     sections = [ParameterSection("", tuple(top)), *chosen, *ahead, *others, last]
     return [section for section in sections if section.names]
