@@ -160,6 +160,15 @@ def test_a_point_is_done_when_the_vein_is_open_again():
     assert "let go" in step.seen
 
 
+@pytest.mark.parametrize(("clot", "advice"), [(None, "press harder"), (CLOT, "let go")])
+def test_who_presses_hard_is_told_to_let_go_at_a_thrombus_alone(clot, advice):
+    at = POINTS[1]
+    way = [(0, at, 0.0), (1, at, 0.0), (1, at, 0.5), (1, at, 0.5), (1, at, 11.0), (1, at, 11.0)]
+    seen = scanned(way, clot=CLOT)  # it is held open, by whatever
+    made = attempt(replace(seen, thrombi={} if clot is None else seen.thrombi))
+    assert advice in made.list_steps()[1].seen
+
+
 def test_a_point_that_was_missed_or_not_closed_is_not_done():
     assert done(scanned(examination((0.01, 0.03, 0.04)))) == [True, True, False]
     soft = attempt(scanned(examination(newtons=(9.0, 5.0, 9.0)))).list_steps()
@@ -230,7 +239,9 @@ def test_a_scene_that_is_loaded_under_a_pressed_probe_scores_nothing():
     made = attempt(scanned([*pressed, *lift(POINTS[0])]))
     assert not any(step.is_done for step in made.list_steps())
     assert made.compute_duration() is None
-    assert done(scanned([*pressed, *lift(POINTS[0]), *examination()])) == [True] * 3
+    made = attempt(scanned([*pressed, *lift(POINTS[0]), *examination()]))
+    assert [step.is_done for step in made.list_steps()] == [True] * 3
+    assert [fault.what for fault in made.faults] == ["9.0 N before the begin"]
 
 
 def test_what_comes_after_the_time_counts_no_more():

@@ -70,8 +70,7 @@ class CentreLine:
             width: m, of the image.
 
         Returns:
-            m along the line, from the end that is first along its main axis, and m along the
-            probe's face from its middle; None where it cuts nothing.
+            m along the line, and m along the face from its middle; None where it cuts nothing.
         """
         seen = pose.inverse().transform_points(self.points)
         across = seen[:, 1]

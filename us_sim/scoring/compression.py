@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from us_sim.errors import ScoreError
 from us_sim.geometry.pose import Pose
 from us_sim.scoring.centre_line import CentreLine
-from us_sim.scoring.exercise import SILENT, Attempt, Fault, Step, Task
+from us_sim.scoring.exercise import LIGHT_FORCE, SILENT, Attempt, Fault, Step, Task
 from us_sim.scoring.metrics import Scan
 from us_sim.scoring.settings import ANSWERS, CONTACT_FORCE, NO_ANSWER, NO_THROMBUS
 from us_sim.settings.quantity import Quantity
@@ -29,7 +29,6 @@ _TOLERANCE = 0.005  # m, from a point, within which it counts, and within which 
 _OPEN = 0.5  # part of its area at rest from which a vessel counts as open
 _ENOUGH = 10.0  # N, after which a vein that is still open holds a thrombus
 _LOOKED = 0.3  # s, for which a person must see a vein open, or closed, to be sure of it
-_LIGHT = 3.0  # N, below which a probe lies on the skin and does not press
 _TURN = np.deg2rad(20.0)  # by which a press may turn
 _EDGE = 3e-3  # m from a thrombus' end, within which both answers are right
 _MM = 1e3
@@ -113,7 +112,7 @@ class _Look(NamedTuple):
     @property
     def is_pressing(self) -> bool:
         """The vein is pressed, by its area or by the force."""
-        return self.is_touching and (self.part < _OPEN or self.force >= _LIGHT)
+        return self.is_touching and (self.part < _OPEN or self.force >= LIGHT_FORCE)
 
 
 @dataclass
@@ -228,8 +227,9 @@ class _Examination(Attempt):
             steps.append(self._thrombus_step())
         limit, seconds = self._task.time_limit, self.compute_duration() or 0.0
         if limit is not None:
-            what, seen = f"within {limit:g} s", f"{seconds:.0f} s"
-            steps.append(self._conclude(what, seconds <= limit, seen))
+            steps.append(
+                self._conclude(f"within {limit:g} s", seconds <= limit, f"{seconds:.0f} s")
+            )
         return steps
 
     def _conclude(
@@ -243,7 +243,8 @@ class _Examination(Attempt):
         """Return the step of a point: what goes on there, or was seen."""
         press, is_here, seen = self._press, abs(self._along - point.at) <= _TOLERANCE, point.seen
         if press is not None and not point.is_done:
-            advice = "press harder" if press.closed is None and press.most < _ENOUGH else "let go"
+            is_shown = press.closed is not None or (press.is_hard and self._has_thrombus(point))
+            advice = "let go" if is_shown else "press harder"
             if is_pressed or (is_here and press.problem):
                 seen = press.problem or f"{press.describe()}: {advice}"
         elif not point.is_done and is_here and self._is_seen_open(self._along):
@@ -263,8 +264,8 @@ class _Examination(Attempt):
             seen = f"{seen}: it is {' or '.join(truths)}"
         elif self.ended is not None and not point.is_examined:
             seen = f"{seen}: right, and not examined: {point.seen}"
-        is_right = is_right and point.is_examined
-        return self._conclude(f"point {number}", is_right, seen, point.place[None])
+        is_done = is_right and point.is_examined
+        return self._conclude(f"point {number}", is_done, seen, point.place[None])
 
     def _thrombus_step(self) -> Step:
         seen = f"at point {self._answer}" if self._answer.isdigit() else self._answer
@@ -339,9 +340,8 @@ class _Examination(Attempt):
         if press.has_slid or not look.is_touching or (slid <= _TOLERANCE and turned <= _TURN):
             return
         press.has_slid = True
-        far = f"turned {np.rad2deg(turned):.0f}°"
-        if slid > _TOLERANCE:
-            far = f"slid {_MM * slid:.0f} mm"
+        way, turn = f"slid {_MM * slid:.0f} mm", f"turned {np.rad2deg(turned):.0f}°"
+        far = way if slid > _TOLERANCE else turn
         press.problem = f"{far} under pressure: let go before you move on"
         self.faults.append(Fault(look.time, press.problem))
 
@@ -386,9 +386,12 @@ class _Examination(Attempt):
             return False, f"closed{_format_force(press.force)} too shortly to be seen"
         if not press.is_hard:
             return False, f"{seen}: not pressed hard and long enough"
-        begin, end = self._thrombus
-        is_thrombus = begin - _TOLERANCE <= point.at <= end + _TOLERANCE
+        is_thrombus = self._has_thrombus(point)
         return is_thrombus, f"{seen}: {'a thrombus' if is_thrombus else 'not closed'}"
+
+    def _has_thrombus(self, point: _Point) -> bool:
+        begin, end = self._thrombus
+        return begin - _TOLERANCE <= point.at <= end + _TOLERANCE
 
 
 def _format_force(force: float) -> str:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import ScoreError
 from us_sim.scoring.centre_line import CentreLine
-from us_sim.scoring.metrics import Scan
+from us_sim.scoring.metrics import Force, Scan
 from us_sim.scoring.settings import CONTACT_FORCE
 from us_sim.settings.choice import ChosenOption
 from us_sim.settings.quantity import Quantity
@@ -30,6 +30,7 @@ _Array = NDArray[np.float64]
 _TIME, _FORCE = Quantity("time", 0.1, 3600.0), Quantity("force", 0.01, 200.0)
 _MM = 1e3
 _MOVED = 1e-3  # m, by which a hand has moved the probe
+LIGHT_FORCE = 3.0  # N, below which a probe lies on the skin and does not press
 SILENT = 1.0  # s without a sample, in which nobody knows whether something was held
 
 
@@ -74,6 +75,7 @@ class Attempt(ABC):
     # s and (3,) m: since when, and from where, the probe is in the air
     _air: tuple[float, _Array] | None = None
     _time = 0.0  # s, of the last pose
+    _pressed = 0.0  # N, the most before the begin
 
     @property
     def was_in_air(self) -> bool:
@@ -87,9 +89,11 @@ class Attempt(ABC):
         if scan.force is not None:
             times, is_touching = scan.force.times, scan.force.newtons >= CONTACT_FORCE
             if not self._has_begun:
-                begin = self._find_begin(scan, times, is_touching)
+                begin = self._find_begin(scan, scan.force)
                 if begin is None:
                     return None
+                if self._pressed >= LIGHT_FORCE:
+                    self.faults = [Fault(begin, f"{self._pressed:.1f} N before the begin")]
                 scan = replace(scan, since=max(scan.since, float(np.nextafter(begin, -np.inf))))
         self._has_begun, self._time = True, float(scan.motion.times[-1])
         if self.touched is None:
@@ -98,19 +102,19 @@ class Attempt(ABC):
         self.add_samples(scan)
         return scan
 
-    def _find_begin(
-        self, scan: Scan, times: _Array, is_touching: NDArray[np.bool_]
-    ) -> float | None:
+    def _find_begin(self, scan: Scan, force: Force) -> float | None:
         """Return since when the probe was in the air from where a hand has moved it.
 
         A force that comes without a motion is a simulation that has just started, and no touch.
         """
-        new = times > scan.since
-        places = scan.motion.interpolate_positions(times[new])
-        for time, place, touches in zip(times[new].tolist(), places, is_touching[new], strict=True):
+        new = force.times > scan.since
+        times, newtons = force.times[new], force.newtons[new].tolist()
+        places = scan.motion.interpolate_positions(times)
+        for time, place, newton in zip(times.tolist(), places, newtons, strict=True):
             if self._air is not None and np.linalg.norm(place - self._air[1]) >= _MOVED:
                 return self._air[0]
-            if touches:
+            self._pressed = max(self._pressed, newton)
+            if newton >= CONTACT_FORCE:
                 self._air = None
             elif self._air is None:
                 self._air = time, place
@@ -158,8 +162,7 @@ class Task(Settings):
     @property
     def structures(self) -> tuple[str, ...]:
         """Names of the vessels that the scene must have."""
-        named = [vars(self).get(key) for key in ("structure", "artery")]
-        return tuple(name for name in named if name)
+        return tuple(filter(None, (vars(self).get(key) for key in ("structure", "artery"))))
 
     @abstractmethod
     def begin_attempt(self, lines: Mapping[str, CentreLine]) -> Attempt:
@@ -306,9 +309,7 @@ class Exercise(Settings):
     def check(self) -> None:
         """Refuse feedback afterwards for a task without a question."""
         if self.feedback == "afterwards" and not self.assigned.asks:
-            raise self.make_error(
-                "feedback", "afterwards is for a compression, which has questions"
-            )
+            raise self.make_error("feedback", "afterwards is for a compression, which asks")
 
     @property
     def assigned(self) -> Any:
@@ -343,9 +344,8 @@ def read_exercise(name: str | Path) -> Exercise:
         if str(name) not in known:
             raise ScoreError(f"exercise {describe_unknown(str(name), sorted(known))}")
         path = known[str(name)]
-    exercise = SettingsReader(str(path), None, ScoreError).read(
-        Exercise, read_yaml(path, ScoreError)
-    )
+    reader = SettingsReader(str(path), None, ScoreError)
+    exercise = reader.read(Exercise, read_yaml(path, ScoreError))
     checksum = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
     return replace(exercise, origin=str(path.resolve()), checksum=checksum)
 

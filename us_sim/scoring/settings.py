@@ -9,8 +9,7 @@ from us_sim.errors import ScoreError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-CONTACT_FORCE = 0.1
-"""N, from which the probe touches the skin; a sensor's noise is below it."""
+CONTACT_FORCE = 0.1  # N, from which the probe touches the skin; a sensor's noise is below it
 STATES = {
     "to lift": "lift the probe off the skin to begin",
     "to do": "begins when the probe touches the skin",
@@ -20,12 +19,9 @@ STATES = {
     "void": "void",
 }
 """Words for the states of an attempt."""
-ANSWERS = ("compressible", "not compressible", "not seen")
-"""A learner's answers on a point of a vein."""
-NO_ANSWER = "-"
-"""Stands for an answer that is not given yet."""
-NO_THROMBUS = "none"
-"""A learner's answer where there is no thrombus."""
+ANSWERS = ("compressible", "not compressible", "not seen")  # a learner's, on a point of a vein
+NO_ANSWER = "-"  # stands for an answer that is not given yet
+NO_THROMBUS = "none"  # a learner's answer where there is none
 
 
 @dataclass(frozen=True)
