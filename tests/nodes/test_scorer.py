@@ -305,8 +305,8 @@ def test_who_moves_the_probe_stands_in_the_result(bench):
     press(bench, 5.0)
     bench.spin_until(lambda: bool(scores))
     bench.spin_until(lambda: told(scores[-1], "about")["moved by"] == "bench")
-    bench.collect(PoseStamped, "probe/pose")
-    bench.spin_until(lambda: told(scores[-1], "about")["heard by"] == "bench")
+    bench.peer.create_publisher(WrenchStamped, "probe/wrench", 1)
+    bench.spin_until(lambda: told(scores[-1], "about")["others"] == "bench")
 
 
 def test_what_was_chosen_at_the_start_stands_in_the_result(bench, small_scene, tmp_path):

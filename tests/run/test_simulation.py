@@ -194,6 +194,12 @@ def test_what_a_person_chose_beside_the_exercise_goes_to_the_scorer():
     assert not any("chosen" in each.parameters for each in drawn.processes)
 
 
+def test_an_arm_is_known_once_a_recording_was_played_in_place_of_it():
+    drawn = RunRequest(load_scene("exercise:examination"))
+    assert drawn.without_replay().scene.is_drawn
+    assert not replace(drawn, everything=True).without_replay().scene.is_drawn
+
+
 def test_all_scenes_are_listed_once_that_which_runs_first(running, small_scene):
     simulation, _, control = running
     for _ in range(40):

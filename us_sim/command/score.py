@@ -59,7 +59,7 @@ def _score_class(args: argparse.Namespace) -> int:
 
     _require_new(args.out, CLASS_FILES)
     table = tabulate_results(read_results(args.of_class))
-    print(table.loc[:, :"heard by"].to_string(index=False))
+    print(table.loc[:, :"arm"].to_string(index=False))
     for file in write_class_table(table, args.out) if args.out is not None else []:
         print(file)
     return 0

@@ -42,6 +42,8 @@ OWN = "scorer"
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 _LEVELS = {"done": OK, "missed": ERROR, "to do": WARN}  # by states of steps
 _REMEMBERED = 256  # poses, for the image with the same stamp
+_OF_PROBE = ("probe/pose", "probe/wrench", "ultrasound/labels")
+_UNNAMED = "_NODE_NAME_UNKNOWN_"  # of a node that has just appeared
 _CHANGING = ("tissue_deformer", "skin_deformer", "slice_interpolator", "probe_tracker")
 """Nodes whose changed parameters are noted in the result."""
 
@@ -77,7 +79,7 @@ class Scorer(SceneNode):
         self._is_tissue_ready = self.scene.tissue is None
         self._changes = dict.fromkeys(self._settings.chosen, "")  # when, by what was set
         self._scene_checksum = self.scene.compute_checksum()
-        self._own_nodes = {OWN, VIEWER, *(part.node for part in self.scene.list_parts())}
+        self._own = {OWN, VIEWER, _UNNAMED, *(part.node for part in self.scene.list_parts())}
         self._begin_attempt()
         self._score = self.create_latched_publisher(DiagnosticArray, "score")
         self._picture = self.create_latched_publisher(CompressedImage, "score/picture")
@@ -105,7 +107,7 @@ class Scorer(SceneNode):
         self._begin = self._measured = 0  # ns
         self._changes = dict.fromkeys(self._changes, "before")
         self._movers: set[str] = set()  # nodes that publish poses
-        self._hearers: set[str] = set()  # and that hear the probe's
+        self._others: set[str] = set()  # beside the scene's, on the topics of the probe
         self._begun = datetime.now().astimezone().isoformat(timespec="seconds")
         self.health.values = {}
 
@@ -140,8 +142,7 @@ class Scorer(SceneNode):
 
     def _on_parameters(self, message: ParameterEvent) -> None:
         """Note changes of the simulation during the attempt, such as of the method."""
-        space = self.get_namespace().rstrip("/")
-        node = message.node.removeprefix(f"{space}/")
+        node = message.node.removeprefix(f"{self.get_namespace().rstrip('/')}/")
         if node not in _CHANGING:
             return
         for changed in message.changed_parameters:
@@ -157,8 +158,10 @@ class Scorer(SceneNode):
             return
         movers = self.get_publishers_info_by_topic(self.resolve_topic_name(LEAD_TOPIC))
         self._movers.update(each.node_name for each in movers)
-        hearers = self.get_subscriptions_info_by_topic(self.resolve_topic_name("probe/pose"))
-        self._hearers.update(each.node_name for each in hearers)
+        for topic in map(self.resolve_topic_name, _OF_PROBE):
+            ends = self.get_publishers_info_by_topic(topic)
+            ends += self.get_subscriptions_info_by_topic(topic)
+            self._others.update(each.node_name for each in ends)
         is_wanted = self._score.get_subscription_count() > 0
         score = self._live.compute_score() if is_wanted or self._place is not None else None
         if score is None:
@@ -198,8 +201,8 @@ class Scorer(SceneNode):
             "volume": self.scene.volume.name,
             "method": tissue.solver if tissue is not None else "none",
             "scene checksum": self._scene_checksum,
-            "moved by": ", ".join(sorted(self._movers)),
-            "heard by": ", ".join(sorted(self._hearers - self._own_nodes)),
+            "moved by": ", ".join(sorted(self._movers - {_UNNAMED})),
+            "others": ", ".join(sorted(self._others - self._own)),
             "changed": "; ".join(f"{what} {when}" for what, when in self._changes.items()),
             "arm": "known from an attempt before" if self._is_known else "",
             "us_sim": __version__,

@@ -404,12 +404,9 @@ class ScorerSettings(Settings):
     )
     student: str = setting(description="name that results bear", default="")
     results: str | None = setting(
-        description="folder, or address of fsspec, for each result",
-        default=None,
+        description="folder, or address of fsspec, for each result", default=None
     )
-    chosen: tuple[str, ...] = setting(
-        description="what was set at the start, beside the scene, which results tell", default=()
-    )
+    chosen: tuple[str, ...] = setting(description="settings that results shall tell", default=())
     answers: tuple[str, ...] = setting(
         description="of the student, if the exercise asks, for each point: compressible, not "
         "compressible, not seen, or - for none yet",

@@ -80,8 +80,7 @@ def follow_plan(
 
 
 def _await_all(update: Callable[[], None], supervisor: Supervisor) -> None:
-    count = len(supervisor.plan.nodes)
-    began = time.monotonic()
+    count, began = len(supervisor.plan.nodes), time.monotonic()
     with ProgressBar("starting", count, "nodes") as bar:
         while waiting := supervisor.waiting:
             update()
@@ -100,9 +99,8 @@ def _stay(update: Callable[[], None], supervisor: Supervisor) -> None:
             now = time.monotonic()
             ended = ended or now if supervisor.finished else None
             bar.update(now - began, _status(supervisor.plan, supervisor.monitor))
-            if duration is not None and now - began > duration:
-                return
-            if ended is not None and now - ended > SETTLE_S:
+            is_over = duration is not None and now - began > duration
+            if is_over or (ended is not None and now - ended > SETTLE_S):
                 return
 
 

@@ -107,8 +107,10 @@ class RunRequest:
         return replace(self.without_replay(), scene=scene, parameters=kept, record=None)
 
     def without_replay(self) -> RunRequest:
-        """Return the same with nothing played."""
-        return replace(self, path=None, topic=None, everything=False, playing={}, is_changed=True)
+        """Return the same with nothing played; one knows an arm before which a recording played."""
+        scene = replace(self.scene, is_drawn=False) if self.everything else self.scene
+        same = replace(self, scene=scene, path=None, topic=None, playing={})
+        return replace(same, everything=False, is_changed=True)
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,14 @@ from us_sim.scoring.result import encode_picture
 
 CLASS_FILES = ("class.csv", "class.html")
 _CHECKSUMS = ("checksum", "scene checksum")
-_ABOUT = ("moved by", "heard by", "volume", "changed", *_CHECKSUMS)
+_ABOUT = ("moved by", "others", "arm", "volume", "method", "changed", *_CHECKSUMS)
 _ALT = "Points right of each attempt, over time, for each student"
 
 
 def tabulate_results(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Return one row for each result: who, what, when, what became of it, and plain metrics.
 
-    Checksums that most results of the exercise do not have are marked.
+    Checksums that most students of the exercise do not have are marked.
     """
     rows = [
         {
@@ -38,7 +38,8 @@ def tabulate_results(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     ]
     table = pd.DataFrame(rows)
     for key in _CHECKSUMS:
-        most = table.groupby("exercise")[key].transform(lambda each: each.mode().iloc[0])
+        votes = table.drop_duplicates(["student", "exercise", key]).groupby("exercise")[key]
+        most = table["exercise"].map(votes.agg(lambda each: each.mode().iloc[0]))
         table[key] = table[key].where(table[key] == most, table[key] + ", unlike most")
     return table
 
