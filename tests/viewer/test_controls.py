@@ -19,14 +19,14 @@ def known(*names: str, **fields: object) -> dict[str, Parameter]:
 
 def test_the_common_come_first_and_the_rest_by_groups():
     parameters = known("noise", "gain", "colour.gain", "depth", "colour.steering", "a.b.c")
-    parameters |= known("scene", "qos.x", is_live=False)
+    parameters |= known("scene", "frame", "qos.x", is_live=False)
     sections = arrange_parameters(parameters, ("depth", "gain", "time_gain"))
     assert [(s.title, s.names) for s in sections] == [
         ("", ("depth", "gain")),
         ("More", ("noise",)),
         ("Colour", ("colour.gain", "colour.steering")),
         ("A · b", ("a.b.c",)),
-        ("Given at the start", ("scene", "qos.x")),
+        ("Given at the start", ("frame", "qos.x")),
     ]
     assert sections[-1].labels["qos.x"] == "qos · x"
 
