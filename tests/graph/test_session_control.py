@@ -84,7 +84,8 @@ def test_scenes_recordings_and_replays_are_changed_while_it_runs(
     control.until(lambda: control.size == (60, 50))
 
     # What was recorded takes the place of the simulation.
-    assert control.set(replay=str(tmp_path / "session.mcap"), replay_as="recording") == ""
+    whole = {"replay": str(tmp_path / "session.mcap"), "replay_as": "recording"}
+    assert control.set(**whole, replay_loop=True) == ""  # a second is over before it is heard
     control.until(lambda: control.size == (96, 80))
     assert set(nodes_of(run.pid)) == {"session_player"}
 

@@ -327,12 +327,14 @@ WebGL2RenderingContext.prototype.getParameter = function (name) {
 def test_with_a_graphics_card_it_looks_the_same_and_is_drawn_into_the_page(page, scene_of):
     seen = scene_of()
     seen.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
+    seen.until("scene.stage.pace.isAtRest")
     read = [seen.becomes(VEIN, is_blue), seen.becomes(ARTERY, is_red)]
     page.add_init_script(HARDWARE)
     seen = scene_of()
     assert not seen.ask("return scene.stage.pace.isSlow")
     assert seen.ask("return scene.stage.canvas.getContext('webgl2') !== null")
     seen.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
+    seen.until("scene.stage.pace.isAtRest")
     drawn = [seen.becomes(VEIN, is_blue), seen.becomes(ARTERY, is_red)]
     page.close()  # no other test has that card
     np.testing.assert_allclose(read, drawn, atol=12)
