@@ -120,4 +120,9 @@ def test_nothing_counts_after_the_end():
     with pytest.raises(ScoreError, match="ended"):
         scan.set_answers(["compressible"], "none")
     scan.clear()
-    assert scan.compute_score() is None
+    for time in (100.0, 101.0):
+        scan.add_pose(time, Pose([0.0, 0.0, 0.0]))
+    assert scan.compute_score() is None  # it was felt before, and is not yet
+    for time in (100.0, 101.0):
+        scan.add_force(time, np.zeros(3))
+    assert scan.compute_score() is not None

@@ -79,7 +79,7 @@ class Scorer(SceneNode):
         self._is_tissue_ready = self.scene.tissue is None
         self._changes = dict.fromkeys(self._settings.chosen, "")  # when, by what was set
         self._scene_checksum = self.scene.compute_checksum()
-        self._own = {OWN, VIEWER, _UNNAMED, *(part.node for part in self.scene.list_parts())}
+        self._own_nodes = {OWN, VIEWER, _UNNAMED, *(part.node for part in self.scene.list_parts())}
         self._begin_attempt()
         self._score = self.create_latched_publisher(DiagnosticArray, "score")
         self._picture = self.create_latched_publisher(CompressedImage, "score/picture")
@@ -202,7 +202,7 @@ class Scorer(SceneNode):
             "method": tissue.solver if tissue is not None else "none",
             "scene checksum": self._scene_checksum,
             "moved by": ", ".join(sorted(self._movers - {_UNNAMED})),
-            "others": ", ".join(sorted(self._others - self._own)),
+            "others": ", ".join(sorted(self._others - self._own_nodes)),
             "changed": "; ".join(f"{what} {when}" for what, when in self._changes.items()),
             "arm": "known from an attempt before" if self._is_known else "",
             "us_sim": __version__,

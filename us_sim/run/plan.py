@@ -107,7 +107,7 @@ class RunRequest:
         return replace(self.without_replay(), scene=scene, parameters=kept, record=None)
 
     def without_replay(self) -> RunRequest:
-        """Return the same with nothing played; one knows an arm before which a recording played."""
+        """Return the same with nothing played; after a whole recording its seed is no secret."""
         scene = replace(self.scene, is_drawn=False) if self.everything else self.scene
         same = replace(self, scene=scene, path=None, topic=None, playing={})
         return replace(same, everything=False, is_changed=True)

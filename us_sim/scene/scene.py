@@ -328,7 +328,8 @@ def _read_named_files(value: Any) -> Any:
     if not isinstance(value, str) or not os.path.isabs(value):
         return value
     path = Path(value)
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else path.name
+    is_readable = path.is_file() and os.access(path, os.R_OK)
+    return hashlib.sha256(path.read_bytes()).hexdigest() if is_readable else path.name
 
 
 def _optional_part(node: str, section: object | None, key: str, consequence: str) -> Part:
